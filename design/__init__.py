@@ -1,0 +1,1 @@
+"""Pure geometry and mechanics: a target surface in, a cut sheet and its predicted behaviour out."""

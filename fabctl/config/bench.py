@@ -1,0 +1,88 @@
+"""The bench file: which devices stand on the table, and by what URL each is reached."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from fabctl.config.loader import Model, load
+from fabctl.errors import ConfigError
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class LaserConfig(Model):
+    """A GRBL laser. `url` is serial:///dev/…?baud=115200, tcp://host:port, or ready:NAME for a started simulator."""
+
+    url: str
+    travel_mm: tuple[Positive, Positive]
+    spot_mm: Positive = 0.1
+    max_run_on_s: Positive = 5.0
+    homing: bool = True
+    origin_mm: tuple[float, float] = (0.0, 0.0)
+    allow_m3: bool = False
+
+
+class RigConfig(Model):
+    """An indentation rig. `map` names the register map in `configs/rigs/`."""
+
+    url: str
+    map: str
+    travel_mm: Positive
+    force_limit_N: Positive
+    indenter_radius_mm: Positive
+    sample_hz: Positive = 100.0
+
+
+class ScanConfig(Model):
+    """Where clouds come from: a folder that a person drops files into, or a command that makes one."""
+
+    inbox: str | None = None
+    command: str | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> ScanConfig:
+        if (self.inbox is None) == (self.command is None):
+            raise ValueError("give either inbox or command")
+        return self
+
+
+class CameraConfig(Model):
+    """The bed camera: a device number or path, a URL, or a folder of pictures."""
+
+    url: str
+    calibration: str | None = None
+
+
+class BenchConfig(Model):
+    """One bench, one file. `{state}` in any text stands for the bench's state folder."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")]
+    laser: LaserConfig | None = None
+    rig: RigConfig | None = None
+    scan: ScanConfig | None = None
+    camera: CameraConfig | None = None
+    specimen_slot: str | None = None
+    deployment: Literal["by_hand", "automatic"] = "by_hand"
+    simulators: dict[str, str] = Field(default_factory=dict)
+
+
+def find(kind: str, name: str, home: Path) -> Path:
+    """Return the file that `name` means: a path, or a name in `configs/<kind>/` of the lab or of the tool."""
+    direct = Path(name)
+    if direct.suffix in (".yaml", ".yml") and direct.is_file():
+        return direct
+    places = [home / "configs" / kind, Path(__file__).resolve().parents[2] / "configs" / kind]
+    for place in places:
+        path = place / f"{name}.yaml"
+        if path.is_file():
+            return path
+    known = sorted({p.stem for place in places if place.is_dir() for p in place.glob("*.yaml")})
+    raise ConfigError([f"{name}: no such file, nor a name in configs/{kind} (known: {', '.join(known) or 'none'})"])
+
+
+def load_bench(name: str, home: Path) -> BenchConfig:
+    """Return the bench called `name`, or the one in the file of that path."""
+    return load(find("benches", name, home), BenchConfig)

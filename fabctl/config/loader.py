@@ -1,0 +1,109 @@
+"""YAML to frozen pydantic models, with the line of every fault.
+
+`yaml.compose` keeps the marks and shows duplicate keys, which `yaml.safe_load` swallows. Scalars follow YAML 1.2's core
+schema as people expect it: `1e3` is a number and `on` is a word.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from fabctl.errors import ConfigError
+
+INT = re.compile(r"[-+]?[0-9]+")
+FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+WORDS: dict[str, bool | None] = {"true": True, "false": False, "null": None, "~": None, "": None}
+
+Marks = dict[tuple[str | int, ...], int]
+
+
+class Model(BaseModel):
+    """Base of every configuration model: frozen, strict, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def load(path: Path, model: type[M]) -> M:
+    """Return the file at `path` as `model`; raise `ConfigError` with all complaints, each `file:line: key: what`."""
+    try:
+        text = path.read_bytes().decode()
+    except FileNotFoundError:
+        raise ConfigError([f"{path}: no such file"]) from None
+    except IsADirectoryError:
+        raise ConfigError([f"{path}: is a folder, not a YAML file"]) from None
+    except (OSError, UnicodeDecodeError) as fault:
+        raise ConfigError([f"{path}: cannot be read as text: {fault}"]) from fault
+    return parse(text, model, str(path))
+
+
+def parse(text: str, model: type[M], name: str) -> M:
+    """Return YAML `text` as `model`; `name` stands in the complaints."""
+    marks: Marks = {}
+    complaints: list[str] = []
+    try:
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as fault:
+        mark = getattr(fault, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        raise ConfigError([f"{name}{line}: not YAML: {getattr(fault, 'problem', None) or fault}"]) from fault
+    data = _value(node, (), marks, complaints, name) if node is not None else {}
+    if not isinstance(data, dict):
+        raise ConfigError([f"{name}:1: a mapping of keys was expected, not {type(data).__name__}"])
+    try:
+        checked = model.model_validate(data)
+    except ValidationError as fault:
+        complaints += [_complaint(error, marks, name) for error in fault.errors()]
+    if complaints:
+        raise ConfigError(complaints)
+    return checked
+
+
+def _value(node: yaml.Node, path: tuple[str | int, ...], marks: Marks, complaints: list[str], name: str) -> Any:
+    marks[path] = node.start_mark.line + 1
+    if isinstance(node, yaml.MappingNode):
+        found: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            key = str(key_node.value)
+            if key in found:
+                complaints.append(f"{name}:{key_node.start_mark.line + 1}: {_dotted((*path, key))}: given twice")
+            found[key] = _value(value_node, (*path, key), marks, complaints, name)
+            marks[(*path, key)] = key_node.start_mark.line + 1
+        return found
+    if isinstance(node, yaml.SequenceNode):
+        # Tuples, because the models are frozen and strict.
+        return tuple(_value(item, (*path, k), marks, complaints, name) for k, item in enumerate(node.value))
+    return _scalar(node)
+
+
+def _scalar(node: yaml.Node) -> Any:
+    text = str(node.value)
+    if getattr(node, "style", None) is not None:  # quoted or block: a string by the author's will
+        return text
+    if text.lower() in WORDS:
+        return WORDS[text.lower()]
+    if INT.fullmatch(text):
+        return int(text)
+    if FLOAT.fullmatch(text):
+        return float(text)
+    return text
+
+
+def _complaint(error: Any, marks: Marks, name: str) -> str:
+    path = tuple(error["loc"])
+    line = next((marks[path[:k]] for k in range(len(path), -1, -1) if path[:k] in marks), 1)
+    text = error["msg"]
+    if error["type"] not in ("missing", "extra_forbidden") and not isinstance(error["input"], dict | tuple):
+        text += f", not {error['input']!r}"
+    return f"{name}:{line}: {_dotted(path)}: {text}" if path else f"{name}:{line}: {text}"
+
+
+def _dotted(path: tuple[str | int, ...]) -> str:
+    return ".".join(map(str, path))

@@ -1,0 +1,54 @@
+"""The material file: what the rubber is, and how the laser treats it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from fabctl.config.bench import Positive, find
+from fabctl.config.loader import Model, load
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class LayerConfig(Model):
+    """Power, speed and passes of one layer."""
+
+    power_frac: Fraction
+    feed_mm_s: Positive
+    passes_count: Annotated[int, Field(ge=1)] = 1
+
+
+class LaserPreset(Model):
+    """How this material is cut on the lab's laser."""
+
+    slit: LayerConfig
+    outline: LayerConfig
+    engrave: LayerConfig
+    mark: LayerConfig
+    kerf_mm: Positive
+    air_assist: bool = True
+    exhaust: bool = True
+    focus_height_mm: Positive | None = None
+
+
+class MaterialConfig(Model):
+    """One sheet material. `never_cut_because` names the danger where a laser must not touch it."""
+
+    name: str
+    E_MPa: Positive
+    nu_ratio: Annotated[float, Field(ge=0, lt=0.5)]
+    thickness_mm: Positive
+    density_kg_m3: Positive
+    edge_mm: Positive = 10.0
+    slit_mm: Positive = 0.125
+    hinge_mm: Positive = 0.25
+    laser: LaserPreset | None = None
+    never_cut_because: str | None = None
+
+
+def load_material(name: str, home: Path) -> MaterialConfig:
+    """Return the material called `name`, or the one in the file of that path."""
+    return load(find("materials", name, home), MaterialConfig)

@@ -1,0 +1,118 @@
+"""Where the lab's files live: runs, specimens, and the state of each bench.
+
+The folder is `$FABCTL_HOME`, or the current one. A specimen's id is the thread through all its runs: it is given once,
+at the cut, and never again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from fabctl.errors import RecordError, UsageError
+from fabctl.records.folder import RunFolder, as_json, open_run, write_atomically
+
+SPECIMEN = re.compile(r"S-\d{4,}")
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """A lab's folder."""
+
+    root: Path
+
+    @property
+    def runs(self) -> Path:
+        """Return the folder of all runs."""
+        return self.root / "runs"
+
+    @property
+    def specimens(self) -> Path:
+        """Return the folder of all specimens."""
+        return self.root / "specimens"
+
+    def bench_state(self, bench: str) -> Path:
+        """Return the folder in which a bench keeps its sockets, logs and slot; it exists."""
+        path = self.root / "bench-state" / bench
+        path.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def new_specimen(self, design: Path) -> Specimen:
+        """Give out the next id, with a copy of the design folder; safe against two cuts at once."""
+        self.specimens.mkdir(parents=True, exist_ok=True)
+        taken = [int(p.name[2:]) for p in self.specimens.iterdir() if SPECIMEN.fullmatch(p.name)]
+        number = max(taken, default=0) + 1
+        while True:
+            path = self.specimens / f"S-{number:04d}"
+            try:
+                path.mkdir()
+                break
+            except FileExistsError:
+                number += 1
+        try:
+            shutil.copytree(design, path / "design")
+        except (OSError, shutil.Error) as fault:
+            raise RecordError(f"{path}: the design cannot be copied: {fault}") from fault
+        body = {"id": path.name, "made_utc": datetime.now(UTC).isoformat(), "design": str(design.resolve())}
+        write_atomically(path / "specimen.json", as_json(body))
+        return Specimen(path)
+
+    def specimen(self, name: str) -> Specimen:
+        """Return the specimen called `name`; raise `UsageError` with the known ones where there is none."""
+        path = self.specimens / name
+        if not SPECIMEN.fullmatch(name) or not (path / "specimen.json").is_file():
+            known = ", ".join(sorted(p.name for p in self.specimens.glob("S-*"))[-5:]) or "none yet"
+            raise UsageError(f"no specimen {name!r} in {self.specimens} (the latest: {known})")
+        return Specimen(path)
+
+    def all_runs(self) -> list[RunFolder]:
+        """Return every readable run, oldest first."""
+        found = []
+        for path in sorted(self.runs.glob("*-*-*")) if self.runs.is_dir() else []:
+            try:
+                found.append(open_run(path))
+            except RecordError:
+                continue  # half made: `fabctl run list` names these separately
+        return found
+
+    def runs_of(self, specimen: str, kind: str | None = None) -> list[RunFolder]:
+        """Return the runs of one specimen, oldest first."""
+        wanted = [run for run in self.all_runs() if run.manifest().get("specimen") == specimen]
+        return [run for run in wanted if kind is None or run.manifest().get("kind") == kind]
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """One sheet with a name."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        """Return the id, such as `S-0042`."""
+        return self.path.name
+
+    @property
+    def design(self) -> Path:
+        """Return the specimen's own copy of the design folder."""
+        return self.path / "design"
+
+    def record(self) -> dict[str, Any]:
+        """Return what is written about the specimen."""
+        found: dict[str, Any] = json.loads((self.path / "specimen.json").read_text(encoding="utf-8"))
+        return found
+
+    def note(self, **facts: Any) -> None:
+        """Add facts to the specimen's record (deployed on, thickness measured, …)."""
+        write_atomically(self.path / "specimen.json", as_json({**self.record(), **facts}))
+
+
+def workspace(home: str | None = None) -> Workspace:
+    """Return the workspace the caller works in."""
+    return Workspace(Path(home or os.environ.get("FABCTL_HOME") or ".").resolve())

@@ -1,0 +1,48 @@
+"""YAML files are read whole, and every fault is named with its line."""
+
+from __future__ import annotations
+
+import pytest
+
+from fabctl.config.bench import BenchConfig
+from fabctl.config.loader import parse
+from fabctl.errors import ConfigError
+
+GOOD = """
+name: lab
+laser:
+  url: serial:///dev/ttyUSB0?baud=115200
+  travel_mm: [300, 2e2]
+"""
+
+
+def complaints(text: str) -> tuple[str, ...]:
+    with pytest.raises(ConfigError) as caught:
+        parse(text, BenchConfig, "lab.yaml")
+    return caught.value.complaints
+
+
+def test_a_number_with_an_exponent_is_a_number() -> None:
+    laser = parse(GOOD, BenchConfig, "lab.yaml").laser
+    assert laser is not None
+    assert laser.travel_mm == (300, 200.0)
+
+
+def test_all_faults_are_named_at_once_with_their_lines() -> None:
+    found = complaints("name: lab\nlaser:\n  url: tcp://x:1\n  travel_mm: [300, wide]\n  travle_mm: 3\nname: again\n")
+    assert [line.split(": ")[0] for line in found] == ["lab.yaml:6", "lab.yaml:4", "lab.yaml:5"]
+    assert "given twice" in found[0]
+    assert "laser.travel_mm.1" in found[1]
+    assert "not 'wide'" in found[1]
+
+
+def test_the_word_on_stays_a_word() -> None:
+    assert "bool" in " ".join(complaints("name: lab\nlaser: {url: x, travel_mm: [1, 1], homing: on}\n"))
+
+
+def test_what_is_not_yaml_says_where() -> None:
+    assert complaints("name: [lab\n")[0].startswith("lab.yaml:2: not YAML")
+
+
+def test_an_empty_file_lacks_its_keys() -> None:
+    assert complaints("") == ("lab.yaml:1: name: Field required",)
