@@ -28,7 +28,6 @@ fresh: setup
 	$(BIN)/python scripts/generated.py
 
 lock: setup
-	$(BIN)/python -m pip --version >/dev/null 2>&1 || true
 	$(BIN)/uv pip compile --universal --generate-hashes --no-header --python-version 3.11 requirements.in -o requirements.lock
 
 clean:

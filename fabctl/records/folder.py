@@ -135,7 +135,7 @@ class RunFolder:
 
     def log_events(self) -> Callable[[Event], None]:
         """Return a listener that writes events to `events.jsonl`, with the time they came."""
-        stream = (self.path / "events.jsonl").open("a", encoding="utf-8", buffering=1)
+        path = self.path / "events.jsonl"
 
         def listen(event: Event) -> None:
             row: dict[str, Any] = {
@@ -146,7 +146,8 @@ class RunFolder:
             }
             if event.done_frac is not None:
                 row["done_frac"] = event.done_frac
-            stream.write(json.dumps(row, default=str) + "\n")
+            with path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(row, default=str) + "\n")
 
         return listen
 

@@ -35,9 +35,12 @@ def test_an_unknown_bench_lists_the_known_ones(tmp_path: Path) -> None:
 
 def test_a_second_user_is_told_who_has_the_bench_and_why(tmp_path: Path) -> None:
     lab = Workspace(tmp_path)
-    with open_bench(lab, config(), "cutting S-0001"), pytest.raises(BenchBusy, match=r"cutting S-0001, since"):
-        with open_bench(lab, config(), "jogging"):
-            pass
+    with (
+        open_bench(lab, config(), "cutting S-0001"),
+        pytest.raises(BenchBusy, match=r"cutting S-0001, since"),
+        open_bench(lab, config(), "jogging"),
+    ):
+        pass
     with open_bench(lab, config(), "jogging"):
         pass
 

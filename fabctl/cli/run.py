@@ -1,0 +1,93 @@
+"""`fabctl run`: what was done, when, by whom, and how it ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from fabctl.cli.common import json_option, lab, show
+from fabctl.errors import UsageError
+from fabctl.records.export import export
+from fabctl.records.folder import RunFolder, open_run, status_of
+from fabctl.records.index import Row, reindex, rows
+
+
+@click.group("run", no_args_is_help=True)
+def command() -> None:
+    """List, show and export run records."""
+
+
+def find_run(name: str) -> RunFolder:
+    """Return the run that `name` means: its id, the beginning or end of it, or a path."""
+    home = lab()
+    if "/" in name or (Path(name) / "manifest.json").is_file():
+        return open_run(Path(name))
+    folders = [p for p in home.runs.iterdir() if p.is_dir()] if home.runs.is_dir() else []
+    matches = [p for p in folders if p.name == name or p.name.startswith(name) or p.name.endswith(name)]
+    if len(matches) == 1:
+        return open_run(matches[0])
+    if not matches:
+        raise UsageError(f"no run {name!r} in {home.runs}; `fabctl run list` names them")
+    raise UsageError(f"{name!r} may be any of {', '.join(sorted(p.name for p in matches))}")
+
+
+@command.command("list")
+@click.option("--specimen", help="Only the runs of this specimen.")
+@click.option("--kind", help="Only runs of this kind (cut, indent, scan, …).")
+@click.option("--status", help="Only runs that ended so (done, stopped, failed, interrupted, …).")
+@json_option
+def list_runs(specimen: str | None, kind: str | None, status: str | None, as_json: bool) -> None:
+    """List all runs, oldest first; a run that nothing ended is *interrupted*."""
+    found = [row for row in rows(lab().runs) if _fits(row, specimen, kind, status)]
+    lines = [
+        f"{row.run:38} {row.specimen or '-':8} {row.status:12} {row.message.splitlines()[0] if row.message else ''}"
+        for row in found
+    ]
+    show({"runs": [row.as_dict() for row in found]}, as_json, lines or ["no runs yet"])
+
+
+def _fits(row: Row, specimen: str | None, kind: str | None, status: str | None) -> bool:
+    asked = ((specimen, row.specimen), (kind, row.kind), (status, row.status))
+    return all(want is None or want == have for want, have in asked)
+
+
+@command.command("show")
+@click.argument("run")
+@json_option
+def show_run(run: str, as_json: bool) -> None:
+    """Show one run: what was asked, what came out, which files are there."""
+    found = find_run(run)
+    manifest, result = found.manifest(), found.result() or {}
+    files = sorted(str(p.relative_to(found.path)) for p in found.path.rglob("*") if p.is_file())
+    state = status_of(found)
+    lines = [
+        f"{found.run_id}: {manifest['kind']}, {state}",
+        f"specimen  {manifest.get('specimen') or '-'}",
+        f"started   {manifest['started_utc']} by {manifest['operator']}",
+        *(f"input     {item['path']}  {item['sha256'][:12]}" for item in manifest["inputs"]),
+        *(f"result    {key} = {value}" for key, value in result.items() if not isinstance(value, dict | list)),
+        *(f"file      {name}" for name in files),
+    ]
+    data = {"run": found.run_id, "path": str(found.path), "status": state, "manifest": manifest, "result": result}
+    show({**data, "outcome": found.outcome(), "files": files}, as_json, lines)
+
+
+@command.command("export")
+@click.argument("run")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Archive to write [RUN.tar.gz].")
+@json_option
+def export_run(run: str, output: Path | None, as_json: bool) -> None:
+    """Pack one run folder into a .tar.gz."""
+    found = find_run(run)
+    target = output or Path(f"{found.run_id}.tar.gz")
+    hashes = export(found, target)
+    show({"archive": str(target), "sha256": hashes}, as_json, [f"{target}: {len(hashes)} files"])
+
+
+@command.command("reindex")
+@json_option
+def reindex_runs(as_json: bool) -> None:
+    """Read every run folder anew and rebuild the index from them."""
+    found = reindex(lab().runs)
+    show({"runs": len(found)}, as_json, [f"{len(found)} runs"])
