@@ -1,0 +1,74 @@
+"""The command line starts light, names its nouns, and ends with the agreed exit codes."""
+
+from __future__ import annotations
+
+import errno
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+
+from design.errors import MeshError
+from design.findings import Finding
+from drivers.errors import TransportError
+from fabctl.cli.common import run_guarded
+from fabctl.errors import BUG, DEVICE, DONE, OPERATOR, REFUSED, USAGE, BenchBusy, ConfigError, RefusedError, Stopped
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def test_help_imports_nothing_heavy() -> None:
+    script = (
+        "import sys; sys.argv = ['fabctl', '--help']\n"
+        "try:\n    from fabctl.cli.main import main; main()\n"
+        "except SystemExit: pass\n"
+        "print(*sorted({name.split('.')[0] for name in sys.modules}))"
+    )
+    said = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    loaded = set(said.splitlines()[-1].split())
+    heavy = {"numpy", "scipy", "open3d", "cv2", "ezdxf", "igl", "matplotlib", "pydantic", "yaml", "serial", "pymodbus"}
+    assert loaded & heavy == set()
+
+
+FAULTS = [
+    (None, DONE),
+    (ConfigError(["lab.yaml:3: laser.url: Field required"]), USAGE),
+    (click.UsageError("no such option"), USAGE),
+    (FileNotFoundError(errno.ENOENT, "No such file or directory", "dome.obj"), USAGE),
+    (MeshError("dome.obj cannot be used", [Finding("MESH-NAN", "3 vertices are not numbers")]), REFUSED),
+    (RefusedError("the cut is refused", [Finding("CUT-X", "too wide")]), REFUSED),
+    (TransportError("serial:///dev/ttyUSB0", "no such port"), DEVICE),
+    (BenchBusy("in use"), DEVICE),
+    (OSError(errno.ENOSPC, "No space left on device", "samples.csv"), DEVICE),
+    (Stopped("by the operator"), OPERATOR),
+    (KeyboardInterrupt(), OPERATOR),
+    (ZeroDivisionError("division by zero"), BUG),
+]
+
+
+@pytest.mark.parametrize(("fault", "code"), FAULTS, ids=lambda value: type(value).__name__)
+def test_every_kind_of_fault_has_its_exit_code(
+    fault: BaseException | None, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @click.command()
+    def command() -> None:
+        if fault is not None:
+            raise fault
+
+    monkeypatch.setattr(sys, "argv", ["fabctl"])
+    assert run_guarded(command) == code
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert ("Traceback" in said.err) == (code == BUG)
+
+
+def test_a_refusal_names_all_its_findings(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    @click.command()
+    def command() -> None:
+        raise RefusedError("the cut is refused", [Finding("CUT-X", "too wide"), Finding("CUT-S", "too strong")])
+
+    monkeypatch.setattr(sys, "argv", ["fabctl"])
+    assert run_guarded(command) == REFUSED
+    assert {"CUT-X", "CUT-S"} <= set(capsys.readouterr().err.replace(":", " ").split())
