@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -55,3 +56,11 @@ def test_no_address_of_a_registry_and_no_path_of_a_machine_is_in_the_lock() -> N
     text = (ROOT / "requirements.lock").read_text()
     assert "://" not in text
     assert "/home/" not in text
+
+
+def test_triangle_whose_licence_forbids_commercial_use_is_never_called() -> None:
+    packages = ("fabctl", "drivers", "design", "simulators", "benchmarks")
+    sources = [path for name in packages for path in (ROOT / name).rglob("*.py")]
+    assert [
+        str(p) for p in sources if re.search(r"igl\.triangle|import triangle\b|igl import triangle", p.read_text())
+    ] == []
