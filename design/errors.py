@@ -23,6 +23,10 @@ class MeshError(DesignError):
     """The target mesh cannot be used."""
 
 
+class UnreadableMesh(MeshError):
+    """The file is missing, empty, cut short, or not what its name says."""
+
+
 class FlattenError(DesignError):
     """The surface could not be laid flat without flips or overlap."""
 

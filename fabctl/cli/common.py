@@ -101,13 +101,17 @@ def run_guarded(command: click.Command) -> int:
 
 def _report(fault: Exception) -> int:
     # Imported here: on the good path `fabctl --help` must not pay for them.
-    from design.errors import DesignError
+    from design.errors import DesignError, UnreadableMesh
     from drivers.errors import DeviceError
 
     if isinstance(fault, FabctlError | DesignError | DeviceError):
-        code = (
-            fault.exit_code if isinstance(fault, FabctlError) else DEVICE if isinstance(fault, DeviceError) else REFUSED
-        )
+        code = REFUSED
+        if isinstance(fault, FabctlError):
+            code = fault.exit_code
+        elif isinstance(fault, DeviceError):
+            code = DEVICE
+        elif isinstance(fault, UnreadableMesh):
+            code = USAGE
         say(f"fabctl: {fault}")
         return code
     if isinstance(fault, OSError):
