@@ -1,0 +1,1 @@
+"""Virtual specimens: force as a function of depth and history."""

@@ -1,0 +1,119 @@
+"""From the words of a status block to a sample that can be believed, or a reason why not. No I/O, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drivers.rig.registers import BadReply, RegisterMap, check_word
+
+HALF = 2**31
+SLACK_S = 0.02  # two clocks of 100 ppm and the time of a frame on the line, with room
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What the controller measured at one of its ticks. `force_N` is gross: no tare is taken off."""
+
+    sequence: int
+    time_s: float
+    position_mm: float
+    force_N: float
+    state: str
+    faults: tuple[str, ...]
+    command_id: int
+    command_state: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """One request for a sample: its number and the host's times around it."""
+
+    request: int
+    sent_s: float
+    received_s: float
+
+
+class Restarted(BadReply):
+    """The controller's sequence ran backwards: it was restarted, and position and limits are gone."""
+
+
+class Freshness:
+    """Believes a status block only where it is whole, answers this very request, and is newer than the last one.
+
+    The sequence counts the controller's ticks, so it must advance as the host's clock does: by no less than the time
+    between the last reply and this request, by no more than that between the last request and this reply.
+    """
+
+    def __init__(self, registers: RegisterMap) -> None:
+        self._map = registers
+        self._last: tuple[int, int, Asked] | None = None
+        self._elapsed_ticks = 0
+        self._doubted: tuple[int, Asked] | None = None
+
+    @property
+    def last_sequence(self) -> int:
+        """Return the newest believed sequence number, 0 before the first: what the watchdog is fed with."""
+        return self._last[0] if self._last else 0
+
+    def believe(self, words: Sequence[int], asked: Asked) -> Sample:
+        """Return the sample, or raise `BadReply` with the reason."""
+        values = self._map.decode("status", words)
+        if "check" in values and values["check"] != check_word(words[:-1]):
+            raise BadReply(f"status: the block's check {values['check']} does not fit its words")
+        if "request_echo" in values and values["request_echo"] != asked.request:
+            raise BadReply(f"status: answers request {values['request_echo']}, asked was {asked.request}: stale")
+        sequence, heartbeat = int(values["sequence"]), int(values.get("heartbeat", -1))
+        self._elapsed_ticks += self._advance(sequence, heartbeat, asked)
+        self._last = (sequence, heartbeat, asked)
+        return Sample(
+            sequence=sequence,
+            time_s=self._elapsed_ticks * self._map.tick_s,
+            position_mm=float(values["position"]),
+            force_N=float(values["force"]),
+            state=_name(self._map.states, int(values["state"])),
+            faults=self._map.fault_names(int(values["faults"])),
+            command_id=int(values["command_id"]),
+            command_state=_name(self._map.command_states, int(values["command_state"])),
+            reason=_name(self._map.reasons, int(values["command_reason"])),
+        )
+
+    def _advance(self, sequence: int, heartbeat: int, asked: Asked) -> int:
+        if self._last is None:
+            return 0
+        before, beat, last = self._last
+        ticks = (sequence - before) % 2**32
+        if ticks == 0:
+            raise BadReply(f"status: sequence {sequence} was there before: frozen")
+        if ticks >= HALF:
+            self._doubt_a_restart(sequence, asked)
+            raise BadReply(f"status: sequence {sequence} after {before}: it ran backwards")
+        least_s, most_s = _passed_s(last, asked)
+        if not least_s <= ticks * self._map.tick_s <= most_s:
+            raise BadReply(
+                f"status: sequence {sequence} is {ticks * self._map.tick_s:.3f} s after {before}, by the host's clock "
+                f"{max(least_s, 0):.3f} to {most_s:.3f} s passed: jumped or stale"
+            )
+        if heartbeat >= 0 and heartbeat == beat:
+            raise BadReply(f"status: the load cell's heartbeat {heartbeat} stands still while the sequence runs")
+        self._doubted = None
+        return ticks
+
+    def _doubt_a_restart(self, sequence: int, asked: Asked) -> None:
+        """Raise `Restarted` where two replies in a row run on from an earlier count; one alone is a bad reply."""
+        doubted, self._doubted = self._doubted, (sequence, asked)
+        if doubted is None:
+            return
+        least_s, most_s = _passed_s(doubted[1], asked)
+        if max(least_s, self._map.tick_s) <= ((sequence - doubted[0]) % 2**32) * self._map.tick_s <= most_s:
+            raise Restarted(f"status: the sequence goes on from {sequence}: the controller was restarted")
+
+
+def _passed_s(last: Asked, asked: Asked) -> tuple[float, float]:
+    """Return the least and the most time that passed between two readings inside the controller."""
+    return asked.sent_s - last.received_s - SLACK_S, asked.received_s - last.sent_s + SLACK_S
+
+
+def _name(names: Sequence[str], code: int) -> str:
+    return names[code] if code < len(names) else f"code{code}"
