@@ -1,0 +1,230 @@
+"""The whole state of the board, and the few acts that interrupt handlers may do to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field, replace
+from enum import Enum, Flag, auto
+
+from simulators.grbl.gcode import Modes, Parser
+from simulators.grbl.planner import Overrides, Planner
+from simulators.grbl.settings import Memory
+from simulators.grbl.stepper import Pin, Stepper
+
+Program = Generator[float, None, None]
+"""A part of the firmware's program. It yields until when it sleeps, deaf; `ANY` waits for the next event."""
+ANY = math.inf
+
+ALARM_HARD_LIMIT, ALARM_SOFT_LIMIT, ALARM_ABORT, ALARM_PROBE_BEFORE, ALARM_PROBE_MISSED = range(1, 6)
+ALARM_HOMING_RESET, ALARM_HOMING_DOOR, ALARM_HOMING_PULL_OFF, ALARM_HOMING_NO_SWITCH = range(6, 10)
+
+
+class State(Enum):
+    """The board's states; the value is the word of the status report."""
+
+    IDLE = "Idle"
+    ALARM = "Alarm"
+    CHECK = "Check"
+    HOMING = "Home"
+    RUN = "Run"
+    HOLD = "Hold"
+    JOG = "Jog"
+    DOOR = "Door"
+    SLEEP = "Sleep"
+
+
+BUSY = frozenset({State.HOMING, State.RUN, State.HOLD, State.JOG, State.DOOR})
+
+
+class Asked(Flag):
+    """What interrupts have asked the program to do."""
+
+    NOTHING = 0
+    STATUS = auto()
+    START = auto()
+    CYCLE_DONE = auto()
+    HOLD = auto()
+    RESET = auto()
+    DOOR = auto()
+    MOTION_CANCEL = auto()
+    SLEEP = auto()
+
+
+class Suspend(Flag):
+    """Why, and how far, the program is suspended."""
+
+    NONE = 0
+    HELD = auto()
+    RESTART_RETRACT = auto()
+    RETRACTED = auto()
+    RESTORE = auto()
+    RESTORED = auto()
+    AJAR = auto()
+    MOTION_CANCEL = auto()
+    JOG_CANCEL = auto()
+
+
+class SpindleStop(Flag):
+    """The laser's switch-off during a hold."""
+
+    NONE = 0
+    BEGIN = auto()
+    ACTIVE = auto()
+    RESTORE = auto()
+    RESTORE_AND_START = auto()
+
+
+@dataclass
+class World:
+    """What stands around the board: limit switches, the door, and a probe that nothing touches.
+
+    `switches` says whether limit switches exist; they lie `travel` apart from where the machine really is, which
+    the board does not know: `real_mm` is the head's true place, 0 at the switch and negative away from it.
+    """
+
+    switches: bool = False
+    real_mm: tuple[float, float, float] = (-5.0, -5.0, -5.0)
+    door_is_open: bool = False
+    switch_stuck: bool = False
+
+
+@dataclass
+class Machine:
+    """The board."""
+
+    memory: Memory = field(default_factory=Memory)
+    world: World = field(default_factory=World)
+    options: str = "V"
+    now_s: float = 0.0
+    state: State = State.IDLE
+    asked: Asked = Asked.NOTHING
+    alarm: int = 0
+    abort: bool = False
+    suspend: Suspend = Suspend.NONE
+    soft_limit_hit: bool = False
+    spindle_stop: SpindleStop = SpindleStop.NONE
+    motion_override: list[int] = field(default_factory=list)
+    accessory_override: list[int] = field(default_factory=list)
+    overrides: Overrides = field(default_factory=Overrides)
+    wco_count: int = 0
+    ov_count: int = 0
+    parser: Parser = field(default_factory=Parser)
+    pin: Pin = field(default_factory=Pin)
+    shown_speed: float = 0.0
+    flood: bool = False
+    probe_armed: bool = False
+    probe_found: bool = False
+    probe_steps: tuple[int, int, int] = (0, 0, 0)
+    say: Callable[[str], None] = print
+    read: Callable[[], int | None] = lambda: None
+    rx_free: Callable[[], int] = lambda: 128
+    flush_rx: Callable[[], None] = lambda: None
+    go_deaf: Callable[[float], None] = lambda until_s: None
+
+    def __post_init__(self) -> None:
+        self.planner = Planner(self.memory, self.overrides)
+        self.stepper = Stepper(self.planner, self.memory, self.pin, self.duty)
+        self.planner.notify = self.stepper.look_again
+
+    def duty(self, speed: float) -> float:
+        """Return the pin's duty for an S word, with the spindle override; the speed shown in reports follows."""
+        speed *= 0.01 * self.overrides.spindle
+        low, high = self.memory[31], self.memory[30]
+        if low >= high or speed >= high:
+            self.shown_speed = high
+            return 1.0
+        if speed <= low:
+            self.shown_speed = low if speed else 0.0
+            return 1 / 255 if speed else 0.0
+        self.shown_speed = speed
+        return (math.floor((speed - low) * 254 / (high - low)) + 1) / 255
+
+    def spindle_off(self) -> None:
+        """Switch the laser pin off."""
+        self.pin.power_frac = 0.0
+
+    def set_spindle(self, mode: int, speed: float) -> None:
+        """Set the laser pin while nothing moves; M4 in laser mode keeps it dark until motion."""
+        if self.abort:
+            return
+        if mode == 5:
+            self.shown_speed = 0.0
+            self.spindle_off()
+        else:
+            self.pin.ccw = mode == 4
+            dark = self.memory.on(32) and mode == 4
+            self.pin.power_frac = self.duty(0.0 if dark else speed)
+        self.ov_count = 0
+
+    def set_coolant(self, flood: bool) -> None:
+        """Set the air assist pin."""
+        if not self.abort:
+            self.flood = flood
+            self.ov_count = 0
+
+    def kill(self) -> None:
+        """Reset, as `0x18` and the limit switches ask for it: laser off and steppers dead at once."""
+        if Asked.RESET in self.asked:
+            return
+        self.asked |= Asked.RESET
+        self.spindle_off()
+        self.flood = False
+        moving = self.state in (State.RUN, State.HOMING, State.JOG)
+        if moving or self.stepper.holding or self.stepper.system_move is not None:
+            if self.state is State.HOMING:
+                self.alarm = self.alarm or ALARM_HOMING_RESET
+            else:
+                self.alarm = ALARM_ABORT
+            self.stepper.halt(self.now_s)
+
+    def position_steps(self) -> tuple[int, int, int]:
+        """Return where the board believes it is, in steps."""
+        return self.stepper.position_at(self.now_s)
+
+    def position_mm(self) -> tuple[float, float, float]:
+        """Return where the board believes it is."""
+        x, y, z = (s / p for s, p in zip(self.position_steps(), self.memory.axes(100), strict=True))
+        return x, y, z
+
+    def limits_hit(self) -> set[int]:
+        """Return the axes whose switch is pressed."""
+        if self.world.switch_stuck:
+            return {0, 1, 2}
+        if not self.world.switches:
+            return set()
+        return {k for k in range(3) if self._real_mm(k) >= 0}
+
+    def _real_mm(self, axis: int) -> float:
+        sign = -1.0 if int(self.memory[23]) & (1 << axis) else 1.0
+        return self.world.real_mm[axis] + sign * self.position_mm()[axis]
+
+    def declare_position(self, steps: tuple[int, int, int]) -> None:
+        """Rename the place where the machine stands; the switches stay where they really are."""
+        real = [self._real_mm(k) for k in range(3)]
+        self.stepper.stand_at(steps)
+        self.world.real_mm = (0.0, 0.0, 0.0)
+        x, y, z = (real[k] - self._real_mm(k) for k in range(3))
+        self.world.real_mm = (x, y, z)
+
+    def sync_position(self) -> None:
+        """Let planner and parser begin from where the machine stands."""
+        self.planner.position_steps = self.position_steps()
+        self.parser = replace(self.parser, position_mm=self.position_mm())
+
+    def reinitialise(self) -> None:
+        """Clear everything a reset clears; state, settings, offsets and position stay."""
+        self.stepper.reset(self.now_s)
+        self.planner.reset(self.stepper.position)
+        self.overrides.feed = self.overrides.rapid = self.overrides.spindle = 100
+        self.asked, self.alarm, self.abort = Asked.NOTHING, 0, False
+        self.suspend, self.spindle_stop, self.soft_limit_hit = Suspend.NONE, SpindleStop.NONE, False
+        self.motion_override.clear()
+        self.accessory_override.clear()
+        self.wco_count = self.ov_count = 0
+        self.shown_speed, self.flood = 0.0, False
+        self.spindle_off()
+        self.probe_steps, self.probe_found, self.probe_armed = (0, 0, 0), False, False
+        self.flush_rx()
+        self.parser = Parser(modes=Modes(), system_mm=self.memory.offsets_mm[0])
+        self.sync_position()

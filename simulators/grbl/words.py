@@ -1,0 +1,62 @@
+"""Numbers as the firmware reads and writes them: eight digits in, single precision inside, rounded decimals out."""
+
+from __future__ import annotations
+
+import struct
+
+MAX_DIGITS = 8  # further digits only shift the decimal point
+MM_PER_INCH = 25.4
+
+
+def f32(value: float) -> float:
+    """Return `value` rounded to single precision, which is all the board has."""
+    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+
+
+def read_number(text: str, at: int) -> tuple[float, int] | None:
+    """Return the number that begins at `at` and where it ends, or None where there is no digit.
+
+    No exponent: `E` is a letter to the firmware.
+    """
+    negative = text[at : at + 1] == "-"
+    if text[at : at + 1] in ("-", "+"):
+        at += 1
+    digits, exponent, count, decimal = 0, 0, 0, False
+    while at < len(text):
+        sign = text[at]
+        if "0" <= sign <= "9":
+            count += 1
+            if count <= MAX_DIGITS:
+                digits = digits * 10 + int(sign)
+                exponent -= decimal
+            elif not decimal:
+                exponent += 1
+        elif sign == "." and not decimal:
+            decimal = True
+        else:
+            break
+        at += 1
+    if not count:
+        return None
+    value = f32(digits * 10.0**exponent)
+    return (-value if negative else value), at
+
+
+def decimals(value: float, places: int) -> str:
+    """Return `value` with `places` decimals, half rounded away from zero."""
+    scaled = int(abs(value) * 10**places + 0.5)
+    sign = "-" if value < 0 else ""
+    if places == 0:
+        return f"{sign}{scaled}"
+    whole, part = divmod(scaled, 10**places)
+    return f"{sign}{whole}.{part:0{places}d}"
+
+
+def coordinate(value_mm: float, inches: bool) -> str:
+    """Return a length as reports show it: three decimals in mm, four in inches."""
+    return decimals(value_mm / MM_PER_INCH, 4) if inches else decimals(value_mm, 3)
+
+
+def rate(value_mm_min: float, inches: bool) -> str:
+    """Return a speed as reports show it: whole mm/min, or inches/min with one decimal."""
+    return decimals(value_mm_min / MM_PER_INCH, 1) if inches else decimals(value_mm_min, 0)
