@@ -7,7 +7,7 @@ import sys
 
 # word -> module with main(words) -> exit code
 DEVICES = {
-    "grbl": "simulators.grbl.program",
+    "grbl": "simulators.grbl.main",
     "rig": "simulators.rig.program",
     "scanner": "simulators.scanner",
     "camera": "simulators.camera",

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from simulators.grbl.machine import Asked, Machine
+from simulators.grbl.machine import Asked, Machine, State
 from simulators.grbl.system import program
 
 BITS_PER_BYTE = 10  # 8N1
@@ -59,6 +59,21 @@ class Board:
         m.rx_free = lambda: self.rx_bytes - len(self._rx)
         self._program = program(m)
         self._byte_s = BITS_PER_BYTE / self.baud if self.baud else 0.0
+        self._run()
+
+    def restart(self) -> None:
+        """Power the board off and on, as a pulse on DTR does: what it was doing is gone, and so is its position."""
+        m = self.machine
+        m.stepper.halt(m.now_s)
+        m.spindle_off()
+        m.state, m.planner.moves = State.IDLE, []
+        real = [m.real_mm(k) for k in range(3)]
+        m.stepper.stand_at((0, 0, 0))
+        m.world.real_mm = (real[0], real[1], real[2])
+        self._wire_in.clear()
+        self._wire_out.clear()
+        self._out_free_s = m.now_s
+        self._program = program(m)
         self._run()
 
     def receive(self, data: bytes) -> None:

@@ -92,7 +92,7 @@ def synchronise(m: Machine) -> Program:
         m.asked |= Asked.START
     while True:
         yield from poll(m)
-        if m.abort or not (m.planner.moves or m.state is State.RUN):
+        if m.aborted() or not (m.planner.moves or m.state is State.RUN):
             return
         yield ANY
 
@@ -110,7 +110,7 @@ def _dwell(m: Machine, seconds: float) -> Program:
         return
     yield from synchronise(m)
     for _ in range(math.ceil(seconds / DWELL_STEP_S - 1e-6)):
-        if m.abort:
+        if m.aborted():
             return
         yield from poll(m)
         yield m.now_s + DWELL_STEP_S
@@ -124,7 +124,7 @@ def line_to(m: Machine, target_mm: Vector, block: Block, power: float, rapid: bo
         return
     while True:
         yield from poll(m)
-        if m.abort:
+        if m.aborted():
             return
         if not m.planner.full:
             break
@@ -133,8 +133,14 @@ def line_to(m: Machine, target_mm: Vector, block: Block, power: float, rapid: bo
         else:
             yield ANY
     built = m.planner.build(
-        target_mm, m.planner.position_steps, block.feed, block.modes.feed_mode == 93, m.parser.modes.spindle, power,
-        rapid, block.jog or 38 <= block.modes.motion < 39,
+        target_mm,
+        m.planner.position_steps,
+        block.feed,
+        block.modes.feed_mode == 93,
+        m.parser.modes.spindle,
+        power,
+        rapid,
+        block.jog or 38 <= block.modes.motion < 39,
     )
     if built is not None:
         m.planner.add(*built)
@@ -159,9 +165,9 @@ def _soft_limit(m: Machine) -> Program:
         m.asked |= Asked.HOLD
         while True:
             yield from poll(m)
-            if m.abort:
+            if m.aborted():
                 return
-            if m.state is State.IDLE:
+            if m.is_in(State.IDLE):
                 break
             yield ANY
     m.kill()
@@ -207,7 +213,7 @@ def _arc(m: Machine, block: Block, power: float) -> Program:
         point[second] = hub[1] + spoke[0] * math.sin(angle) + spoke[1] * math.cos(angle)
         point[normal] = start[normal] + (block.target_mm[normal] - start[normal]) * k / count
         yield from line_to(m, (point[0], point[1], point[2]), block, power, rapid=False)
-        if m.abort:
+        if m.aborted():
             return
     yield from line_to(m, block.target_mm, block, power, rapid=False)
 
@@ -217,16 +223,16 @@ def _probe(m: Machine, block: Block, power: float) -> Generator[float, None, boo
     if m.state is State.CHECK:
         return True
     yield from synchronise(m)
-    if m.abort:
+    if m.aborted():
         return False
     m.probe_found = False
     yield from line_to(m, block.target_mm, block, power, rapid=False)
     m.asked |= Asked.START
     while True:
         yield from poll(m)
-        if m.abort:
+        if m.aborted():
             return False
-        if m.state is State.IDLE:
+        if m.is_in(State.IDLE):
             break
         yield ANY
     quiet = round(block.modes.motion * 10) in (383, 385)
@@ -268,4 +274,3 @@ def _jog(m: Machine, block: Block) -> Status:
         wake(m)
     m.parser = replace(m.parser, position_mm=block.target_mm)
     return OK
-

@@ -311,9 +311,7 @@ def _shift(axis: int, block: Block, base: Vector, parser: Parser) -> float:
     return base[axis] + parser.g92_mm[axis] + (parser.tool_length_mm if axis == 2 else 0.0)
 
 
-def _set_system(
-    block: Block, words: _Words, xyz: list[float], parser: Parser, memory: Memory, used: set[str]
-) -> None:
+def _set_system(block: Block, words: _Words, xyz: list[float], parser: Parser, memory: Memory, used: set[str]) -> None:
     if not words.axes:
         raise Fault(NO_AXIS_WORDS)
     if not {"P", "L"} & set(words.values):

@@ -22,22 +22,22 @@ PHASES = 4  # seek, pull off, locate, pull off
 
 
 def home(m: Machine) -> Program:
-    """Home all axes; ends with `m.abort` set where it failed."""
+    """Home all axes; ends with `m.aborted()` set where it failed."""
     for axes in CYCLES:
         yield from _home_axes(m, axes)
     yield from poll(m)
-    if not m.abort:
+    if not m.aborted():
         m.sync_position()
 
 
 def _home_axes(m: Machine, axes: tuple[int, ...]) -> Program:
-    if m.abort:
+    if m.aborted():
         return
     travel_mm = max(SEARCH_RATIO * m.memory[130 + k] for k in axes)
     approach, feed = True, m.memory[25]
     for _ in range(PHASES):
         yield from _phase(m, axes, approach, travel_mm, feed)
-        if m.abort:
+        if m.aborted():
             return
         approach = not approach
         travel_mm = m.memory[27] * (LOCATE_RATIO if approach else 1.0)

@@ -127,6 +127,14 @@ class Machine:
         self.stepper = Stepper(self.planner, self.memory, self.pin, self.duty)
         self.planner.notify = self.stepper.look_again
 
+    def aborted(self) -> bool:
+        """Return whether a reset is under way."""
+        return self.abort
+
+    def is_in(self, state: State) -> bool:
+        """Return whether the board is in `state` now; time may have passed since the caller last looked."""
+        return self.state is state
+
     def duty(self, speed: float) -> float:
         """Return the pin's duty for an S word, with the spindle override; the speed shown in reports follows."""
         speed *= 0.01 * self.overrides.spindle
@@ -193,18 +201,19 @@ class Machine:
             return {0, 1, 2}
         if not self.world.switches:
             return set()
-        return {k for k in range(3) if self._real_mm(k) >= 0}
+        return {k for k in range(3) if self.real_mm(k) >= 0}
 
-    def _real_mm(self, axis: int) -> float:
+    def real_mm(self, axis: int) -> float:
+        """Return how far the head is past the switch of `axis`; negative while it has not reached it."""
         sign = -1.0 if int(self.memory[23]) & (1 << axis) else 1.0
         return self.world.real_mm[axis] + sign * self.position_mm()[axis]
 
     def declare_position(self, steps: tuple[int, int, int]) -> None:
         """Rename the place where the machine stands; the switches stay where they really are."""
-        real = [self._real_mm(k) for k in range(3)]
+        real = [self.real_mm(k) for k in range(3)]
         self.stepper.stand_at(steps)
         self.world.real_mm = (0.0, 0.0, 0.0)
-        x, y, z = (real[k] - self._real_mm(k) for k in range(3))
+        x, y, z = (real[k] - self.real_mm(k) for k in range(3))
         self.world.real_mm = (x, y, z)
 
     def sync_position(self) -> None:

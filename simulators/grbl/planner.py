@@ -71,8 +71,15 @@ class Planner:
         self.last_unit, self.last_nominal_mm_s = (0.0, 0.0, 0.0), 0.0
 
     def build(
-        self, target_mm: Vector, origin_steps: tuple[int, int, int], feed: float, inverse_time: bool, spindle: int,
-        speed: float, rapid: bool, no_override: bool,
+        self,
+        target_mm: Vector,
+        origin_steps: tuple[int, int, int],
+        feed: float,
+        inverse_time: bool,
+        spindle: int,
+        speed: float,
+        rapid: bool,
+        no_override: bool,
     ) -> tuple[Move, Vector, tuple[int, int, int]] | None:
         """Return the move to `target_mm`, its direction and its goal in steps; None where it has no step to make."""
         per_mm = self.memory.axes(100)
@@ -180,7 +187,7 @@ def _limit_entry(move: Move, nominal: float, before: float) -> None:
 
 
 def _round(value: float) -> int:
-    return int(math.floor(abs(value) + 0.5)) * (1 if value >= 0 else -1)
+    return math.floor(abs(value) + 0.5) * (1 if value >= 0 else -1)
 
 
 def _unit(vector: list[float]) -> tuple[Vector, float]:

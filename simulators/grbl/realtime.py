@@ -215,12 +215,12 @@ def _suspended(m: Machine) -> Program:
     if m.memory.on(32):
         m.accessory_override.append(0x9E)  # a hold in laser mode darkens the beam
     while m.suspend:
-        if m.abort:
+        if m.aborted():
             return
         if Suspend.HELD in m.suspend:
             if m.state in (State.DOOR, State.SLEEP):
                 yield from _door_or_sleep(m, mode, speed, flood)
-                if m.abort:
+                if m.aborted():
                     return
             elif m.spindle_stop:
                 _stop_or_restore(m, mode, speed)
@@ -229,7 +229,7 @@ def _suspended(m: Machine) -> Program:
                 m.stepper.update_pin = False
         before = (m.suspend, m.spindle_stop, m.state, m.asked)
         yield from _system(m)
-        if m.suspend and (m.suspend, m.spindle_stop, m.state, m.asked) == before and not m.abort:
+        if m.suspend and (m.suspend, m.spindle_stop, m.state, m.asked) == before and not m.aborted():
             yield ANY
 
 
@@ -263,9 +263,9 @@ def _door_or_sleep(m: Machine, mode: int, speed: float, flood: bool) -> Program:
         m.say("[MSG:Sleeping]\r\n")
         m.set_spindle(5, 0.0)
         m.set_coolant(False)
-        while not m.abort:
+        while not m.aborted():
             yield from _system(m)
-            if not m.abort:
+            if not m.aborted():
                 yield ANY
         return
     if not m.world.door_is_open:
@@ -287,7 +287,7 @@ def _door_or_sleep(m: Machine, mode: int, speed: float, flood: bool) -> Program:
 
 def _pause(m: Machine, seconds: float) -> Program:
     for _ in range(round(seconds / DWELL_STEP_S)):
-        if m.abort or Suspend.RESTART_RETRACT in m.suspend:
+        if m.aborted() or Suspend.RESTART_RETRACT in m.suspend:
             return
         yield from _system(m)
         yield m.now_s + DWELL_STEP_S

@@ -58,7 +58,7 @@ def _state(m: Machine) -> str:
         if Suspend.RETRACTED not in m.suspend:
             return "Door:2"
         return "Door:1" if Suspend.AJAR in m.suspend else "Door:0"
-    return m.state.value
+    return str(m.state.value)
 
 
 def parameters(m: Machine) -> list[str]:

@@ -42,9 +42,7 @@ class Stretch:
 
     def at(self, events: int) -> tuple[int, int, int]:
         """Return the position in steps after so many step events."""
-        x, y, z = (
-            s + _nearest(d * events / self.step_events) for s, d in zip(self.start, self.steps, strict=True)
-        )
+        x, y, z = (s + _nearest(d * events / self.step_events) for s, d in zip(self.start, self.steps, strict=True))
         return x, y, z
 
 
@@ -332,4 +330,4 @@ class Stepper:
 
 
 def _nearest(value: float) -> int:
-    return int(math.floor(value + 0.5)) if value >= 0 else -int(math.floor(-value + 0.5))
+    return math.floor(value + 0.5) if value >= 0 else -math.floor(-value + 0.5)

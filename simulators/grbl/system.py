@@ -36,7 +36,7 @@ def _main_loop(m: Machine) -> Program:
             sign = chr(byte)
             if sign in "\r\n":
                 yield from poll(m)
-                if m.abort:
+                if m.aborted():
                     return
                 status = OVERFLOW if overflow else (yield from _dispatch(m, line))
                 yield from _deaf_while_writing(m)
@@ -56,7 +56,7 @@ def _main_loop(m: Machine) -> Program:
         if m.planner.moves:
             m.asked |= Asked.START
         yield from poll(m)
-        if m.abort:
+        if m.aborted():
             return
         if not (m.planner.moves and m.state is State.IDLE):
             yield float("inf")
@@ -155,7 +155,7 @@ def _home(m: Machine, line: str) -> Status:
     if len(line) > 2:
         return INVALID
     yield from home(m)
-    if not m.abort:
+    if not m.aborted():
         m.state = State.IDLE
         yield from _startup(m)
     return OK
