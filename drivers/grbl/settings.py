@@ -1,0 +1,114 @@
+"""Who the board is and how it is set: `$I`, `$$`, `$#`, `$G`, `$N` as values. No I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from drivers.grbl.messages import Banner, Info, Message, Report, Setting, Startup, Vector
+
+RX_FALLBACK_BYTES = 128
+RX_LEAST_BYTES = 16
+PLANNER_FALLBACK_COUNT = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """The board: firmware, options, buffers, settings, offsets, start-up lines."""
+
+    firmware: str  # grbl, grblHAL or FluidNC
+    version: str
+    options: str
+    rx_bytes: int
+    planner_count: int
+    settings: dict[int, float] = field(default_factory=dict)
+    offsets_mm: dict[str, Vector] = field(default_factory=dict)
+    modes: str = ""
+    startup: tuple[str, ...] = ()
+
+    def setting(self, number: int) -> float | None:
+        """Return a `$` setting, or None where the board does not tell it."""
+        return self.settings.get(number)
+
+    def is_on(self, number: int) -> bool:
+        """Return whether a switch setting is on; one that the board does not tell counts as off."""
+        return bool(self.settings.get(number, 0.0))
+
+    @property
+    def homes_to_zero(self) -> bool:
+        """Return whether machine space is positive (`Z` in the build options); else it runs from minus travel to 0."""
+        return "Z" in self.options
+
+    @property
+    def reports_inches(self) -> bool:
+        """Return whether positions come in inches (`$13`)."""
+        return self.is_on(13)
+
+    def work_offset_mm(self) -> Vector:
+        """Return machine minus work position of the active coordinate system, as `$#` and `$G` say."""
+        active = next((word for word in self.modes.split() if word in self.offsets_mm and word != "G92"), "G54")
+        base = self.offsets_mm.get(active, (0.0, 0.0, 0.0))
+        g92 = self.offsets_mm.get("G92", (0.0, 0.0, 0.0))
+        return base[0] + g92[0], base[1] + g92[1], base[2] + g92[2]
+
+
+def identify(messages: Iterable[Message], idle: Report | None) -> Identity:
+    """Return the identity that the answers to `$I $$ $# $G $N` amount to.
+
+    The receive buffer is the third field of `[OPT:…,blocks,bytes]` (the second is planner blocks); where absent, the
+    free bytes of an idle `Bf:`; else 128.
+    """
+    version = options = modes = ""
+    firmware = "grbl"
+    fields: list[str] = []
+    settings: dict[int, float] = {}
+    offsets: dict[str, Vector] = {}
+    startup: list[str] = []
+    for message in messages:
+        if isinstance(message, Setting):
+            settings |= _number(message)
+        elif isinstance(message, Startup):
+            startup.append(message.line)
+        elif isinstance(message, Banner):
+            firmware = _firmware(message.text, firmware)
+        elif isinstance(message, Info):
+            if message.kind == "VER":
+                version = message.text
+                firmware = _firmware(message.text, firmware)
+            elif message.kind == "OPT":
+                options, *fields = message.text.split(",")
+            elif message.kind == "FIRMWARE":
+                firmware = _firmware(message.text, firmware)
+            elif message.kind == "GC":
+                modes = message.text
+            elif message.kind.startswith("G") and "," in message.text:
+                offsets |= _offset(message)
+    rx_bytes = int(fields[1]) if len(fields) > 1 and fields[1].isdigit() else None
+    if rx_bytes is None and idle is not None and idle.state == "Idle":
+        rx_bytes = idle.free_bytes
+    if rx_bytes is None or rx_bytes < RX_LEAST_BYTES:
+        rx_bytes = RX_FALLBACK_BYTES
+    blocks = int(fields[0]) if fields and fields[0].isdigit() else PLANNER_FALLBACK_COUNT
+    return Identity(firmware, version, options, rx_bytes, blocks, settings, offsets, modes, tuple(startup))
+
+
+def _firmware(text: str, before: str) -> str:
+    lower = text.lower()
+    if "fluidnc" in lower:
+        return "FluidNC"
+    return "grblHAL" if "grblhal" in lower else before
+
+
+def _number(message: Setting) -> dict[int, float]:
+    try:
+        return {message.number: float(message.value)}
+    except ValueError:
+        return {}  # other dialects keep texts in some settings
+
+
+def _offset(message: Info) -> dict[str, Vector]:
+    try:
+        parts = [float(part) for part in message.text.split(",")]
+    except ValueError:
+        return {}
+    return {message.kind: (parts[0], parts[1], parts[2] if len(parts) > 2 else 0.0)}
