@@ -186,28 +186,37 @@ def _component_count(mesh: TriMesh) -> int:
 
 def _pinched_vertices(mesh: TriMesh) -> Indices:
     """Return the vertices whose faces do not form one fan: their corners, joined over shared edges, fall apart."""
+    count = len(mesh.vertices_mm)
+    vertex_and_fan = np.column_stack([mesh.faces.ravel(), corner_fans(mesh.faces, count).ravel()])
+    return np.flatnonzero(np.bincount(np.unique(vertex_and_fan, axis=0)[:, 0], minlength=count) > 1)
+
+
+def corner_fans(faces: Faces, count: int, cut: Indices | None = None) -> Indices:
+    """Return `(m, 3)` labels: corners at a vertex share one where a walk over edges around it joins them.
+
+    `cut` holds edges `(k, 2)` that join nothing.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    m, count = len(mesh.faces), len(mesh.vertices_mm)
-    corner = np.arange(3 * m).reshape(m, 3)
-    tail, head = mesh.faces, np.roll(mesh.faces, -1, axis=1)
+    corner = np.arange(faces.size).reshape(faces.shape)
+    tail, head = faces, np.roll(faces, -1, axis=1)
     code = (np.minimum(tail, head) * count + np.maximum(tail, head)).ravel()
     order = np.argsort(code, kind="stable")
     same = code[order[1:]] == code[order[:-1]]
+    if cut is not None:
+        same &= ~np.isin(code[order[1:]], cut.min(axis=1) * count + cut.max(axis=1))
     one, two = order[:-1][same], order[1:][same]
-    # Each shared edge ties the two corners at either end; which end is which follows from the vertex.
-    ends_one = np.stack([corner.ravel()[one], np.roll(corner, -1, axis=1).ravel()[one]])
-    ends_two = np.stack([corner.ravel()[two], np.roll(corner, -1, axis=1).ravel()[two]])
-    vertex = mesh.faces.ravel()
-    swapped = vertex[ends_one[0]] != vertex[ends_two[0]]
-    ends_two = np.where(swapped, ends_two[::-1], ends_two)
-    ties = coo_array(
-        (np.ones(ends_one.size, dtype=np.int8), (ends_one.ravel(), ends_two.ravel())), shape=(3 * m, 3 * m)
-    )
-    fan = connected_components(ties.tocsr(), directed=False)[1]
-    fans_of = np.unique(np.column_stack([vertex, fan]), axis=0)[:, 0]
-    return np.flatnonzero(np.bincount(fans_of, minlength=count) > 1)
+    # Each shared edge ties the corners at either end; which end is which follows from the vertex.
+    following = np.roll(corner, -1, axis=1).ravel()
+    ends_one = np.stack([corner.ravel()[one], following[one]])
+    ends_two = np.stack([corner.ravel()[two], following[two]])
+    vertex = faces.ravel()
+    ends_two = np.where(vertex[ends_one[0]] != vertex[ends_two[0]], ends_two[::-1], ends_two)
+    ones = np.ones(ends_one.size, dtype=np.int8)
+    ties = coo_array((ones, (ends_one.ravel(), ends_two.ravel())), shape=(faces.size, faces.size))
+    labels: Indices = connected_components(ties.tocsr(), directed=False)[1].astype(np.int64)
+    return labels.reshape(faces.shape)
 
 
 def _fault(code: str, text: str, which: Indices, hint: str, warns: bool = False, edges: int = 0) -> Finding:

@@ -6,9 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.errors import FlattenError
+from design.surface import Indices, Points
 
 Values = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+
+
+def edge_lengths_mm(vertices_mm: Points, loop: Indices) -> Values:
+    """Return the length of the edge that leaves each vertex of a loop."""
+    points = vertices_mm[loop]
+    return np.asarray(np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1))
 
 
 def tangents(turning_rad: Values) -> Complex:
@@ -17,14 +24,19 @@ def tangents(turning_rad: Values) -> Complex:
     return np.exp(1j * angle)
 
 
-def close(lengths_mm: Values, weights: Values, tangent: Complex, period_mm: complex = 0.0) -> Values:
+def close(
+    lengths_mm: Values, weights: Values, tangent: Complex, period_mm: complex = 0.0, twins: Indices | None = None
+) -> Values:
     """Return the lengths nearest to `lengths_mm` with which the curve ends `period_mm` from where it began.
 
     The change is measured by Σ (change²/weight), so an edge yields in proportion to its weight (its original length).
+    `twins[i]` is the edge that changes with edge i, as the two sides of a seam do (i itself where none does).
     """
-    T = np.stack([tangent.real, tangent.imag])
-    gap = T @ lengths_mm - np.array([np.real(period_mm), np.imag(period_mm)])
-    closed = lengths_mm - weights * (T.T @ np.linalg.solve((T * weights) @ T.T, gap))
+    step = tangent if twins is None else (tangent + tangent[twins]) / 2
+    T = np.stack([step.real, step.imag])
+    gap = np.sum(lengths_mm * tangent) - period_mm
+    change = weights * (T.T @ np.linalg.solve((T * weights) @ T.T, [gap.real, gap.imag]))
+    closed = lengths_mm - change
     if (closed <= 0).any():
         count = int(np.count_nonzero(closed <= 0))
         raise FlattenError(f"the flat's rim cannot be closed: {count} of its edges would have no length")

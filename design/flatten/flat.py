@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from design.errors import FlattenError
 from design.findings import Finding, errors
-from design.flatten.curve import close, tangents, trace
-from design.flatten.laplace import Laplace, angle_defects, laplace
+from design.flatten.cones import place_cones, seams_of
+from design.flatten.cut import Cut, cut_along
+from design.flatten.disk import disk, lay_out, rim_u
 from design.flatten.quality import check_flat, signed_areas_mm2
-from design.flatten.result import Flattening, FlattenOptions
-from design.surface import Indices, Points, TriMesh, boundary_loops
+from design.flatten.result import Flattening, FlattenOptions, Seam
+from design.flatten.tube import lay_strip, tube, tube_scale_factors
+from design.surface import Faces, Indices, Points, TriMesh, boundary_loops
 
 Values = NDArray[np.float64]
 DEFAULTS = FlattenOptions()
+TUBE_ABOVE_ratio = 2.0  # a spread beyond any library: rather a seam than a filled hole
 
 
 def flatten(mesh: TriMesh, options: FlattenOptions = DEFAULTS) -> Flattening:
@@ -22,73 +27,139 @@ def flatten(mesh: TriMesh, options: FlattenOptions = DEFAULTS) -> Flattening:
 
     `mesh` must be one oriented manifold piece with a boundary (`read_mesh` sees to that); holes are closed for the
     computation and open again afterwards. Raises `FlattenError` with all findings where the flat has flipped faces or
-    overlaps itself.
+    overlaps itself, whatever is tried: fewer boundary modes, then a Laplacian of better shaped triangles.
     """
     loops = boundary_loops(mesh)
     if not loops:
         raise FlattenError("the surface is closed; a sheet has an edge")
-    filled = fill_holes(mesh, loops[1:])
-    flat_mm, u = _lay_disk(filled, loops[0], options)
-    count = len(mesh.vertices_mm)
-    found = check_flat(mesh, flat_mm[:count], mesh.faces, loops)
-    if errors(found) and options.laplacian == "cotangent":
-        # Obtuse triangles make the plain Laplacian lose the maximum principle; the intrinsic one keeps it.
-        flat_mm, u = _lay_disk(filled, loops[0], _with_delaunay(options))
-        again = check_flat(mesh, flat_mm[:count], mesh.faces, loops)
-        found = [*again, Finding("FLAT-DELAUNAY", "badly shaped faces: the intrinsic Laplacian was used", "info")]
-    if errors(found):
-        raise FlattenError("the surface could not be laid flat", found)
-    return finish(mesh, flat_mm[:count], u[:count], found)
+    tries = [options]
+    if options.boundary == "optimised":
+        tries += [replace(options, modes_count=count) for count in (8, 4, 2) if count < options.modes_count]
+    tries += [replace(tries[-1], laplacian="delaunay")]
+    faults: list[Finding] = []
+    for asked in tries:
+        flat = _flatten_as_asked(mesh, loops, asked)
+        if not errors(flat.findings):
+            return replace(flat, findings=(*flat.findings, *_changed(options, asked)))
+        faults = faults or list(flat.findings)
+    raise FlattenError("the surface could not be laid flat", faults)
 
 
-def finish(mesh: TriMesh, flat_mm: Points, u: Values, found: list[Finding]) -> Flattening:
-    """Return the flattening of a mesh without seams."""
-    expansion_ratio = np.sqrt(mesh.face_areas_mm2() / np.abs(signed_areas_mm2(flat_mm, mesh.faces)))
-    return Flattening(mesh, flat_mm, mesh.faces, np.arange(len(flat_mm)), expansion_ratio, u, (), tuple(found))
+def _changed(options: FlattenOptions, used: FlattenOptions) -> list[Finding]:
+    found = []
+    if used.modes_count != options.modes_count:
+        text = f"the boundary was optimised with {used.modes_count} modes only; with more the flat overlapped itself"
+        found.append(Finding("FLAT-MODES", text, "info"))
+    if used.laplacian != options.laplacian:
+        found.append(Finding("FLAT-DELAUNAY", "badly shaped faces: the intrinsic Laplacian was used", "info"))
+    return found
 
 
-def fill_holes(mesh: TriMesh, holes: list[Indices]) -> TriMesh:
-    """Return the mesh with every hole closed by a fan around its centroid; vertices and faces keep their numbers."""
-    vertices_mm, faces = [mesh.vertices_mm], [mesh.faces]
-    for number, hole in enumerate(holes):
-        centre = np.full(len(hole), len(mesh.vertices_mm) + number)
-        vertices_mm.append(mesh.vertices_mm[hole].mean(axis=0, keepdims=True))
-        faces.append(np.column_stack([np.roll(hole, -1), hole, centre]))
-    return TriMesh(np.vstack(vertices_mm), np.vstack(faces))
+def _flatten_as_asked(mesh: TriMesh, loops: list[Indices], options: FlattenOptions) -> Flattening:
+    if options.cut_path is not None and not (len(loops) > 1 and _joins(loops, options.cut_path)):
+        return _flatten_cut(mesh, cut_along(mesh, [options.cut_path]), options)
+    if options.cones_count:
+        return _flatten_with_cones(mesh, loops, options)
+    if len(loops) > 1 and options.seam != "none":
+        if options.seam == "tube" or options.cut_path is not None:
+            return _flatten_tube(mesh, loops, options)
+        flat = _flatten_disk(mesh, loops, options)
+        if errors(flat.findings) or flat.spread_ratio() > TUBE_ABOVE_ratio:
+            strip = _flatten_tube(mesh, loops, options)
+            return strip if errors(flat.findings) or strip.spread_ratio() < flat.spread_ratio() else flat
+        return flat
+    return _flatten_disk(mesh, loops, options)
 
 
-def _with_delaunay(options: FlattenOptions) -> FlattenOptions:
-    return FlattenOptions(options.boundary, options.boundary_u, "delaunay")
+def _joins(loops: list[Indices], path: Indices) -> bool:
+    """Say whether a path leads from one of the two longest loops to the other."""
+    ends = [next((k for k, loop in enumerate(loops[:2]) if end in loop), -1) for end in (path[0], path[-1])]
+    return sorted(ends) == [0, 1]
 
 
-def _lay_disk(mesh: TriMesh, border: Indices, options: FlattenOptions) -> tuple[Points, Values]:
-    """Return flat points `(n, 2)` and scale factors `(n,)` of a disk whose boundary loop is `border`."""
-    operator = laplace(mesh, border, options.laplacian)
-    curvature = angle_defects(mesh, border)
-    u = operator.extend(_border_u(border, options), -curvature)
-    return lay_out(mesh, operator, curvature, u), u
+def _flatten_disk(mesh: TriMesh, loops: list[Indices], options: FlattenOptions) -> Flattening:
+    surface = disk(mesh, loops, options.laplacian)
+    u = surface.scale_factors(rim_u(surface, options, options.modes_count))
+    flat_mm = lay_out(surface, u)[: surface.count]
+    found = check_flat(mesh, flat_mm, mesh.faces, loops)
+    return _finish(mesh, flat_mm, mesh.faces, np.arange(surface.count), u[: surface.count], (), found)
 
 
-def _border_u(border: Indices, options: FlattenOptions) -> Values:
-    if options.boundary == "isometric":
-        return np.zeros(len(border))
-    if options.boundary_u is None:
-        raise FlattenError("a prescribed boundary needs `boundary_u`, one value per vertex of the mesh")
-    return np.asarray(options.boundary_u[border], dtype=np.float64)
+def _flatten_tube(mesh: TriMesh, loops: list[Indices], options: FlattenOptions) -> Flattening:
+    surface = tube(mesh, loops, options.laplacian)
+    path = options.cut_path
+    if path is not None and path[0] in loops[1]:
+        path = path[::-1]
+    strip = lay_strip(surface, tube_scale_factors(surface, options), path)
+    faces = strip.cut.mesh.faces[: len(mesh.faces)]
+    # The fans over further holes go; their centres lie between the mesh's own vertices and the seam's copies.
+    keep = np.concatenate([np.arange(surface.count), np.arange(len(surface.mesh.vertices_mm), len(strip.flat_mm))])
+    number = np.cumsum(np.isin(np.arange(len(strip.flat_mm)), keep)) - 1
+    flat_mm, faces, index = strip.flat_mm[keep], number[faces], strip.cut.target_index[keep]
+    seam = Seam(number[strip.left], number[strip.right], 0.0, (strip.period_mm, 0.0), 0.0, closes_tube=True)
+    opened = TriMesh(mesh.vertices_mm[index], faces)
+    found = check_flat(opened, flat_mm, faces, boundary_loops(opened))
+    return _finish(mesh, flat_mm, faces, index, strip.u[keep], (_measured(seam, flat_mm),), found)
 
 
-def lay_out(mesh: TriMesh, operator: Laplace, curvature: Values, u: Values) -> Points:
-    """Return the flat `(n, 2)` whose rim has the lengths and turning that `u` asks for, its inside harmonic."""
-    border = operator.border
-    turning = curvature[border] + operator.flux(u)
-    before = edge_lengths_mm(mesh.vertices_mm, border)
-    asked = before * np.exp(0.5 * (u[border] + np.roll(u[border], -1)))
-    tangent = tangents(turning)
-    rim = trace(close(asked, before, tangent), tangent)
-    return operator.extend(np.column_stack([rim.real, rim.imag]))
+def _flatten_with_cones(mesh: TriMesh, loops: list[Indices], options: FlattenOptions) -> Flattening:
+    surface = disk(mesh, loops, options.laplacian)
+    cones = place_cones(surface, options.cones_count, options.modes_count)
+    useful = cones.vertices[cones.angles_rad > 1e-3]
+    if len(useful) == 0:
+        return _flatten_disk(mesh, loops, replace(options, cones_count=0, boundary="optimised"))
+    opened = cut_along(mesh, seams_of(surface, useful))
+    return _flatten_cut(mesh, opened, replace(options, boundary="prescribed", boundary_u=cones.u))
 
 
-def edge_lengths_mm(vertices_mm: Points, loop: Indices) -> Values:
-    """Return the length of the edge that leaves each vertex of a loop."""
-    points = vertices_mm[loop]
-    return np.asarray(np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1))
+def _flatten_cut(mesh: TriMesh, opened: Cut, options: FlattenOptions) -> Flattening:
+    """Flatten a surface that was cut from inside to its rim; both sides of a cut keep the same lengths."""
+    loops = boundary_loops(opened.mesh)
+    index = opened.target_index
+    surface = disk(opened.mesh, loops, options.laplacian)
+    given = None if options.boundary_u is None else options.boundary_u[index]
+    u = surface.scale_factors(rim_u(surface, replace(options, boundary_u=given), options.modes_count))
+    flat_mm = lay_out(surface, u, _twins(surface.rim, opened))[: surface.count]
+    seams = tuple(_measured(Seam(left, right, 0.0, (0.0, 0.0), 0.0), flat_mm) for right, left in opened.sides)
+    found = check_flat(opened.mesh, flat_mm, opened.mesh.faces, loops)
+    return _finish(mesh, flat_mm, opened.mesh.faces, index, u[: surface.count], seams, found)
+
+
+def _twins(rim: Indices, opened: Cut) -> Indices:
+    """Return for each rim edge the edge that lies on it when the cut is closed, or itself."""
+    place = np.full(len(opened.mesh.vertices_mm), -1)
+    place[rim] = np.arange(len(rim))
+    twins = np.arange(len(rim))
+    for left, right in opened.sides:
+        # The rim follows the faces: along the chain on its left, against it on its right.
+        one, other = place[left[:-1]], place[right[1:]]
+        twins[one], twins[other] = other, one
+    return twins
+
+
+def _measured(seam: Seam, flat_mm: Points) -> Seam:
+    """Return the seam with the motion that carries its left side onto its right one, and the gap that is left."""
+    a, b = flat_mm[seam.left] @ [1, 1j], flat_mm[seam.right] @ [1, 1j]
+    turn = 1.0 + 0j
+    if not seam.closes_tube:
+        inner = np.vdot(a - a.mean(), b - b.mean())
+        turn = inner / abs(inner)
+    shift = b.mean() - turn * a.mean() if not seam.closes_tube else complex(*seam.translation_mm)
+    gap_mm = float(np.abs(turn * a + shift - b).max())
+    return replace(
+        seam, rotation_rad=float(np.angle(turn)), translation_mm=(float(shift.real), float(shift.imag)), gap_mm=gap_mm
+    )
+
+
+def _finish(
+    mesh: TriMesh,
+    flat_mm: Points,
+    faces: Faces,
+    index: Indices,
+    u: Values,
+    seams: tuple[Seam, ...],
+    found: list[Finding],
+) -> Flattening:
+    with np.errstate(divide="ignore"):  # a collapsed face is among the findings
+        expansion_ratio = np.sqrt(mesh.face_areas_mm2() / np.abs(signed_areas_mm2(flat_mm, faces)))
+    return Flattening(mesh, flat_mm, faces, index, expansion_ratio, u, seams, tuple(found))

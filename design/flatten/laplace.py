@@ -46,15 +46,17 @@ class Laplace:
         return np.asarray((self.A @ values)[self.border])
 
 
-def laplace(mesh: TriMesh, border: Indices, kind: Laplacian = "cotangent") -> Laplace:
-    """Assemble and factor; `delaunay` flips edges intrinsically first, which no badly shaped triangle survives."""
+def assemble(mesh: TriMesh, kind: Laplacian = "cotangent") -> csc_array:
+    """Return A over all vertices; `delaunay` flips edges intrinsically first, so that no angle is badly obtuse."""
     if kind == "delaunay":
         lengths_mm = igl.edge_lengths(mesh.vertices_mm, mesh.faces)
-        stiffness = igl.intrinsic_delaunay_cotmatrix(lengths_mm, mesh.faces)[0]
-    else:
-        stiffness = igl.cotmatrix(mesh.vertices_mm, mesh.faces)
-    A = csc_array(-stiffness)
-    inside = np.ones(len(mesh.vertices_mm), dtype=bool)
+        return csc_array(-igl.intrinsic_delaunay_cotmatrix(lengths_mm, mesh.faces)[0])
+    return csc_array(-igl.cotmatrix(mesh.vertices_mm, mesh.faces))
+
+
+def factored(A: csc_array, border: Indices) -> Laplace:
+    """Factor the inner block of A, all but the rows and columns of `border`."""
+    inside = np.ones(A.shape[0], dtype=bool)
     inside[border] = False
     inner = np.flatnonzero(inside)
     columns = A[:, border]

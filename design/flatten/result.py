@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from design.surface import Faces, Indices, Points, TriMesh
 
 Boundary = Literal["isometric", "prescribed", "optimised"]
 Laplacian = Literal["cotangent", "delaunay"]
+SeamChoice = Literal["auto", "tube", "none"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,11 +22,19 @@ class FlattenOptions:
     """How the surface is to be laid flat.
 
     `boundary`: `isometric` keeps the rim's length (u = 0, the published way), `prescribed` takes `boundary_u`,
-    `optimised` chooses the rim so that the spread of expansions is least.
+    `optimised` chooses the rim so that the spread of expansions is least. `seam`: a surface with two ends is laid flat
+    as a strip with one seam (`tube`), or with its smaller end filled as a hole (`none`); `auto` takes the seam where a
+    filled hole would ask for more than any library has. `cut_path` is a chain of vertices to cut along: the seam of a
+    tube, or a dart from the rim inwards. `cones_count` cones are placed where they help most, the rim optimised with
+    them.
     """
 
     boundary: Boundary = "isometric"
     boundary_u: NDArray[np.float64] | None = None  # (n,) over the mesh's vertices, read on the boundary only
+    modes_count: int = 24  # waves along the rim that an optimised boundary may use
+    seam: SeamChoice = "auto"
+    cut_path: Indices | None = None
+    cones_count: int = 0
     laplacian: Laplacian = "cotangent"
 
 
@@ -32,8 +42,9 @@ class FlattenOptions:
 class Seam:
     """Two chains of flat points that are one line on the target.
 
-    `right = turn(left, rotation_rad) + translation_mm`, up to `gap_mm`. A tube's seam does not turn: its sheet repeats
-    by `translation_mm`, so that a pattern whose period divides it runs on across the joint.
+    `right = turn(left, rotation_rad) + translation_mm`, up to `gap_mm`. The seam that closes a tube does not turn: its
+    sheet repeats by `translation_mm` (along x), so that a pattern whose period divides it runs on across the joint. A
+    cone's seam begins in the cone, where both chains share their first point.
     """
 
     left: Indices
@@ -41,6 +52,7 @@ class Seam:
     rotation_rad: float
     translation_mm: tuple[float, float]
     gap_mm: float
+    closes_tube: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,3 +75,34 @@ class Flattening:
     def diagonal_mm(self) -> float:
         """Return the diagonal of the flat's bounding box."""
         return float(np.linalg.norm(np.ptp(self.flat_mm, axis=0)))
+
+    def scaled(self, factor_ratio: float) -> Flattening:
+        """Return the same with the flat `factor_ratio` times as large, and so the expansions that much smaller."""
+        seams = tuple(
+            replace(
+                seam,
+                translation_mm=(seam.translation_mm[0] * factor_ratio, seam.translation_mm[1] * factor_ratio),
+                gap_mm=seam.gap_mm * factor_ratio,
+            )
+            for seam in self.seams
+        )
+        return replace(
+            self,
+            flat_mm=self.flat_mm * factor_ratio,
+            expansion_ratio=self.expansion_ratio / factor_ratio,
+            u=self.u + math.log(factor_ratio),
+            seams=seams,
+        )
+
+    def whole_cell_scales(self, cell_mm: float, low_ratio: float, high_ratio: float) -> list[tuple[int, float]]:
+        """Return `(cells around, scale of the flat)` for which the tube's period is a whole number of cells.
+
+        All scales from `low_ratio` to `high_ratio` are listed. The period lies along x, as the lattice's rows do, so
+        any whole number repeats the tiling with its inverted units; across the rows an even number would be needed.
+        """
+        seam = next((seam for seam in self.seams if seam.closes_tube), None)
+        if seam is None:
+            return []
+        period_mm = math.hypot(*seam.translation_mm)
+        first, last = math.ceil(low_ratio * period_mm / cell_mm), math.floor(high_ratio * period_mm / cell_mm)
+        return [(count, count * cell_mm / period_mm) for count in range(max(first, 1), last + 1)]
