@@ -1,0 +1,157 @@
+"""Press a rigid sphere into the deployed sheet: load against depth, in and out again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.deploy.levels import Layout, prolong, refine
+from design.deploy.newton import System, solve
+from design.deploy.shell import Ints, Reals
+
+CONTACT_RATIO = 20.0  # stiffness of a contact point over median k_d: it sinks in by a thousandth of a millimetre or so
+SOLVED_COUNT = 1500  # units are divided until the sheet has about this many triangles: the footprint is below a unit
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """Load of an indenter, pressed in and drawn out along a common grid of depths from first contact."""
+
+    depth_mm: Reals  # (k,) ascending from 0
+    load_N: Reals  # (k,)
+    unload_N: Reals  # (k,)
+    indenter_radius_mm: float
+    point_mm: tuple[float, float, float]  # of first contact, in the frame of the deployed mesh
+    direction: tuple[float, float, float]  # unit vector into the surface
+    residual_ratio: float  # the worst of all equilibria of the curve
+    recovered_mm: float  # the furthest any vertex stays from where it began, after release
+
+    def stiffness_N_mm(self, depth_mm: float) -> float:
+        """Return the secant stiffness of loading to `depth_mm`."""
+        return float(np.interp(depth_mm, self.depth_mm, self.load_N) / depth_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """A rigid sphere that vertices cannot enter: energy ½·stiffness·penetration² at each."""
+
+    centre_mm: Reals  # (3,)
+    radius_mm: float
+    stiffness_N_mm: Reals  # (n,)
+
+    def _penetration(self, x: Reals) -> tuple[Ints, Reals, Reals]:
+        away = x - self.centre_mm
+        distance = np.linalg.norm(away, axis=1)
+        touching = np.flatnonzero(distance < self.radius_mm)
+        return touching, self.radius_mm - distance[touching], away[touching] / distance[touching, None]
+
+    def energy(self, x_mm: Reals) -> float:
+        """Return the energy, mJ."""
+        touching, depth, _ = self._penetration(x_mm)
+        return float(0.5 * np.sum(self.stiffness_N_mm[touching] * depth**2))
+
+    def add(self, x_mm: Reals, gradient_N: Reals, blocks_N_mm: Reals) -> None:
+        """Add gradient and Hessian blocks."""
+        touching, depth, out = self._penetration(x_mm)
+        k = self.stiffness_N_mm[touching]
+        gradient_N[touching] -= (k * depth)[:, None] * out
+        outer = out[:, :, None] * out[:, None, :]
+        bend = depth / (self.radius_mm - depth)
+        blocks_N_mm[touching] += k[:, None, None] * (outer - bend[:, None, None] * (np.eye(3) - outer))
+
+    def force_N(self, x_mm: Reals) -> Reals:
+        """Return the force `(3,)` that the sheet exerts on the sphere."""
+        touching, depth, out = self._penetration(x_mm)
+        return np.asarray(-np.sum((self.stiffness_N_mm[touching] * depth)[:, None] * out, axis=0))
+
+
+def border(cells: Ints, vertex_count: int) -> NDArray[np.bool_]:
+    """Return which vertices lie on the rim, `(n,)`."""
+    from design.deploy.shell import neighbours
+
+    unit, corner = np.nonzero(neighbours(cells) < 0)
+    rim = np.zeros(vertex_count, dtype=bool)
+    rim[cells[unit, (corner + 1) % 3]] = rim[cells[unit, (corner + 2) % 3]] = True
+    return rim
+
+
+def first_contact(x_mm: Reals, point_mm: Reals, direction: Reals, radius_mm: float) -> float:
+    """Return how far along `direction` from `point_mm` the sphere's foot can go before a vertex touches it.
+
+    The sphere comes along the line through `point_mm`; the answer is the least over the vertices near that line.
+    """
+    away = x_mm - point_mm
+    along = away @ direction
+    aside = np.linalg.norm(away - along[:, None] * direction, axis=1)
+    near = aside < radius_mm
+    return float(np.min(along[near] + radius_mm - np.sqrt(radius_mm**2 - aside[near] ** 2)))
+
+
+def indentation_response(
+    layout: Layout,
+    x_mm: Reals,
+    indenter_radius_mm: float,
+    depth_max_mm: float,
+    steps_count: int = 24,
+    point_mm: Reals | None = None,
+    direction: tuple[float, float, float] = (0.0, 0.0, -1.0),
+    parts: int | None = None,
+    watch: Callable[[float], None] | None = None,
+) -> Response:
+    """Return the load of a rigid sphere pressed to `depth_max_mm` at a point and drawn back, rim held.
+
+    `x_mm` is the deployed equilibrium of `layout`. The point is by default the highest against `direction`. Each unit
+    is divided into `parts`² triangles (by default until there are about 1,500), because the footprint is smaller than
+    a unit; the rim's vertices then stay where the free divided sheet has them. `watch(fraction)` sees progress.
+    Frictionless under the sphere; no loss in the rubber: a difference between the curves is a snap.
+    """
+    if parts is None:
+        parts = int(np.clip(round((SOLVED_COUNT / len(layout.cells)) ** 0.5), 1, 4))
+    fine = refine(layout, parts)
+    system = System(fine.shell())
+    free = solve(system, x_mm if parts == 1 else prolong(layout, x_mm, fine))
+    x = _on_top_of(free.x_mm[: layout.vertex_count], x_mm, free.x_mm)
+    way = np.asarray(direction, float) / np.linalg.norm(direction)
+    foot = x[int(np.argmin(x @ way))] if point_mm is None else np.asarray(point_mm, float)
+    start = first_contact(x, foot, way, indenter_radius_mm)
+    foot = foot + start * way
+    rim = np.repeat(border(fine.cells, fine.vertex_count)[:, None], 3, axis=1)
+    stiffness = np.full(fine.vertex_count, CONTACT_RATIO * float(np.median(system.shell.dilation_N_mm)))
+    depths = np.linspace(0.0, depth_max_mm, steps_count + 1)
+    loads: list[float] = []
+    worst, begin = 0.0, x
+    for k, depth in enumerate([*depths, *depths[::-1]]):
+        ball = Sphere(foot + (depth - indenter_radius_mm) * way, indenter_radius_mm, stiffness)
+        found = solve(system, x, [ball], rim)
+        x, worst = found.x_mm, max(worst, found.residual_ratio)
+        loads.append(float(ball.force_N(x) @ -way))
+        if watch is not None:
+            watch((k + 1) / (2 * len(depths)))
+    back = float(np.linalg.norm(x - begin, axis=1).max())
+    half = len(depths)
+    there, again = np.array(loads[:half]), np.array(loads[half:])[::-1]
+    point, into = (float(foot[0]), float(foot[1]), float(foot[2])), (float(way[0]), float(way[1]), float(way[2]))
+    return Response(depths, there, again, indenter_radius_mm, point, into, worst, back)
+
+
+def _on_top_of(source_mm: Reals, goal_mm: Reals, all_mm: Reals) -> Reals:
+    """Return `all_mm` moved as brings `source_mm` onto `goal_mm`."""
+    from design.deploy.compare import kabsch
+
+    rotation, shift = kabsch(source_mm, goal_mm)
+    return np.asarray(all_mm @ rotation.T + shift)
+
+
+def response_csv(response: Response) -> str:
+    """Return the text of `response.csv`, version 1: one line of facts, a header, then one row a depth."""
+    point = ",".join(f"{v:.6g}" for v in response.point_mm)
+    direction = ",".join(f"{v:.6g}" for v in response.direction)
+    head = (
+        f"# fabctl response 1; indenter_radius_mm={response.indenter_radius_mm:.6g}; "
+        f"point_mm={point}; direction={direction}\ndepth_mm,load_N,unload_N\n"
+    )
+    rows = zip(response.depth_mm, response.load_N, response.unload_N, strict=True)
+    return head + "".join(f"{d:.6f},{f:.9g},{u:.9g}\n" for d, f, u in rows)
