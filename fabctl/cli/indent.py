@@ -1,0 +1,177 @@
+"""`fabctl indent`: record, analyse, compare and export force against displacement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+
+if TYPE_CHECKING:
+    from fabctl.indent.job import IndentPlan
+    from fabctl.records.folder import RunFolder
+
+
+@click.group()
+def command() -> None:
+    """Record and analyse force against displacement."""
+
+
+@command.command("run")
+@click.argument("specimen")
+@click.option("--method", default="dome", show_default=True, help="Method file or its name in configs/methods.")
+@bench_option
+@click.option("--resume", metavar="RUN", help="Go on with an interrupted run, at its next whole curve or point.")
+@click.option("--temperature-degC", type=float, help="Room temperature, where the rig has no sensor of its own.")
+@click.option("--humidity-frac", type=float, help="Relative humidity, 0 to 1.")
+@click.option("--dry-run", is_flag=True, help="Stop after the check; nothing moves.")
+@yes_option
+@json_option
+def run_command(
+    specimen: str,
+    method: str,
+    bench_name: str,
+    resume: str | None,
+    temperature_degc: float | None,
+    humidity_frac: float | None,
+    dry_run: bool,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    """Press a SPECIMEN by a method and record its force."""
+    from fabctl.bench import open_bench
+    from fabctl.cli.steering import Keys
+    from fabctl.config.bench import load_bench
+    from fabctl.errors import Stopped
+    from fabctl.indent.job import Steering, plan_test, refuse, run_test
+    from fabctl.records.folder import open_run
+
+    place = lab()
+    bench_config = load_bench(bench_name, place.root)
+    earlier = open_run(place.runs / resume) if resume else None
+    plan = plan_test(place, place.specimen(specimen), method, bench_config, earlier)
+    for line in _screen(plan, bench_config.name):
+        say(line)
+    refuse(plan)
+    if dry_run:
+        show(_planned(plan), as_json, ["dry run: nothing was moved"])
+        return
+    if not confirm("Start?", yes):
+        raise Stopped("not started")
+    facts = {"temperature_degC": temperature_degc, "humidity_frac": humidity_frac}
+    with open_bench(place, bench_config, f"testing {specimen}") as bench, Keys(progress()) as keys:
+        run = run_test(
+            place,
+            plan,
+            bench,
+            keys.listen,
+            Steering(keys.wish, keys.go_on),
+            {name: value for name, value in facts.items() if value is not None},
+        )
+    _render(run, as_json)
+
+
+@command.command("analyse")
+@click.argument("runs", nargs=-1)
+@click.option("--group", "groups", multiple=True, metavar="NAME=RUN,RUN,…", help="Compare groups of runs.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Picture of all curves (SVG or PNG).")
+@json_option
+def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path | None, as_json: bool) -> None:
+    """Analyse RUNS anew from their samples: run ids, folders, or specimens (all their runs)."""
+    from fabctl.errors import UsageError
+    from fabctl.indent.groups import analyse_groups, parse_groups
+
+    named = parse_groups(lab(), runs, groups)
+    if not named:
+        raise UsageError("name at least one run, specimen or --group")
+    body = analyse_groups(named, output)
+    lines = []
+    for name, found in body["groups"].items():
+        lines.append(f"{name}: {len(found['runs'])} runs")
+        lines += list(_lines(found["runs"][0]["result"])) if len(found["runs"]) == 1 else []
+        if found.get("stiffness_secant_N_mm") is not None:
+            spread = found["stiffness_secant_N_mm"]
+            lines.append(f"  secant stiffness {spread['mean']:.4g} ± {spread['sd']:.2g} N/mm (n = {spread['count']})")
+    for ratio in body["ratios"]:
+        ends = (
+            f"{ratio['low_ratio']:.3f} to {ratio['high_ratio']:.3f}"
+            if ratio["low_ratio"] is not None
+            else f"no interval: {ratio['reason']}"
+        )
+        lines.append(f"{ratio['above']} / {ratio['below']}: {ratio['value_ratio']:.3f}, 95 % {ends} ({ratio['how']})")
+    show(body, as_json, lines)
+
+
+@command.command("export")
+@click.argument("run")
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(["csv", "parquet", "hdf5", "bluesky"]),
+    default="csv",
+    show_default=True,
+)
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True)
+@json_option
+def export_command(run: str, kind: str, output: Path, as_json: bool) -> None:
+    """Write the samples of RUN for other programs: CSV with units, Parquet, HDF5, or bluesky documents."""
+    from fabctl.indent.export import export
+    from fabctl.indent.groups import find_run
+
+    found = export(find_run(lab(), run), kind, output)
+    show(found, as_json, [f"{output}: {found['rows_count']} rows"])
+
+
+def _screen(plan: IndentPlan, bench: str) -> Iterator[str]:
+    limits = plan.method.limits
+    yield f"{plan.specimen.name} on bench {bench}, method {plan.method.name}: {plan.method.description}"
+    yield (
+        f"  limits in the controller: {limits.force_N:g} N gross, {limits.travel_mm:g} mm, "
+        f"watchdog {limits.watchdog_s:g} s"
+    )
+    peak = plan.predicted_peak_N
+    yield f"  predicted peak {peak:.2f} N" if peak is not None else "  no predicted response"
+    count = len({(a.point, a.curve) for a in plan.actions if a.curve})
+    yield f"  {count} curves, about {plan.time_s:.0f} s, {plan.sample_hz:g} samples a second"
+    if plan.resumes:
+        yield f"  goes on with {plan.resumes}"
+    for finding in plan.findings:
+        yield f"  {finding}"
+
+
+def _planned(plan: IndentPlan) -> dict[str, Any]:
+    return {
+        "specimen": plan.specimen.name,
+        "method": plan.method.name,
+        "time_s": plan.time_s,
+        "predicted_peak_N": plan.predicted_peak_N,
+        "curves_count": len({(a.point, a.curve) for a in plan.actions if a.curve}),
+        "findings": [finding.as_dict() for finding in plan.findings],
+    }
+
+
+def _render(run: RunFolder, as_json: bool) -> None:
+    result = run.result() or {}
+    body = {"run": run.run_id, "path": str(run.path), "status": "done", **result}
+    show(body, as_json, [f"run {run.run_id}", *_lines(result), f"  {run.path / 'artefacts' / 'curve.svg'}"])
+
+
+def _lines(result: dict[str, Any]) -> Iterator[str]:
+    named = (
+        ("stiffness at contact", "stiffness_initial_N_mm", "N/mm"),
+        ("secant stiffness", "stiffness_secant_N_mm", "N/mm"),
+        ("largest force", "force_max_N", "N"),
+        ("energy in", "load_energy_mJ", "mJ"),
+        ("hysteresis", "hysteresis_ratio", ""),
+        ("barrier", "barrier_mJ", "mJ"),
+        ("recovery", "recovery_ratio", ""),
+    )
+    for words, name, unit in named:
+        value = result.get(name)
+        if value is None:
+            yield f"  {words:22} not found: {result.get('not_found', {}).get(name, 'no curve')}"
+        else:
+            yield f"  {words:22} {value:.4g} {unit}"

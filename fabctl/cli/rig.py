@@ -1,0 +1,184 @@
+"""`fabctl rig`: talk to the indentation rig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fabctl.cli.common import bench_option, confirm, json_option, lab, show, yes_option
+
+if TYPE_CHECKING:
+    from drivers.rig.indenter import Indenter
+    from drivers.rig.samples import Sample
+    from fabctl.config.bench import RigConfig
+
+JOG_FORCE_N = 1.0  # an operator's hand-driven motion stops at the first touch
+
+
+@click.group()
+def command() -> None:
+    """Talk to the indentation rig: info, jog, tare, home, calibrate."""
+
+
+@command.command()
+@bench_option
+@json_option
+def info(bench_name: str, as_json: bool) -> None:
+    """Say who answers and how it stands; nothing moves."""
+    with _rig(bench_name, "asking the rig") as (rig, _):
+        identity, air, now = rig.identify(), rig.environment(), rig.fresh_sample()
+    body = {
+        "model": identity.model,
+        "serial": identity.serial,
+        "firmware": identity.firmware,
+        "capacity_N": identity.capacity_N,
+        "travel_mm": identity.travel_mm,
+        **air,
+        **_state(now),
+    }
+    show(body, as_json, [f"{name:18} {value}" for name, value in body.items()])
+
+
+@command.command()
+@bench_option
+@click.option("--time-s", default=1.0, show_default=True, help="How long to average.")
+@json_option
+def tare(bench_name: str, time_s: float, as_json: bool) -> None:
+    """Average the force with the indenter free: the zero, its noise and drift. Nothing moves."""
+    import numpy as np
+
+    with _rig(bench_name, "reading the zero") as (rig, _):
+        found = _sampled(rig, time_s)
+    forces, times = np.array([s.force_N for s in found]), np.array([s.time_s for s in found])
+    drift = float(np.polyfit(times, forces, 1)[0]) if len(found) > 2 else 0.0
+    noise = float(forces.std(ddof=1))
+    body = {"zero_N": float(forces.mean()), "noise_N": noise, "drift_N_s": drift, "samples_count": len(found)}
+    show(body, as_json, [f"zero {body['zero_N']:.4f} N, noise {noise:.4f} N, drift {1000 * drift:.3f} mN/s"])
+
+
+@command.command()
+@bench_option
+@click.option("--speed-mm-s", default=5.0, show_default=True)
+@yes_option
+@json_option
+def home(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
+    """Drive up to the home switch, where position is 0."""
+    _moved(bench_name, "home", "Drive up to the home switch?", yes, as_json, lambda rig, _: rig.home(speed_mm_s))
+
+
+@command.command()
+@click.argument("by_mm", type=float)
+@bench_option
+@click.option("--speed-mm-s", default=1.0, show_default=True)
+@yes_option
+@json_option
+def jog(by_mm: float, bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
+    """Move BY_MM (positive: down). Downwards it stops at the first touch, 1 N above what the cell shows now."""
+
+    def begin(rig: Indenter, now: Sample) -> int:
+        goal_mm = now.position_mm + by_mm
+        if by_mm > 0:
+            return rig.move(goal_mm, speed_mm_s, "above", now.force_N + JOG_FORCE_N)
+        return rig.move(goal_mm, speed_mm_s)
+
+    _moved(bench_name, "jog", f"Move {by_mm:+g} mm?", yes, as_json, begin)
+
+
+@command.command()
+@bench_option
+@click.option("--speed-mm-s", default=1.0, show_default=True)
+@yes_option
+@json_option
+def retract(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
+    """Clear a latched fault and drive up to position 0, slowly; never downwards."""
+    _moved(
+        bench_name,
+        "retract",
+        "Clear the faults and drive up?",
+        yes,
+        as_json,
+        lambda rig, _: rig.move(0.0, speed_mm_s),
+    )
+
+
+@command.command()
+@bench_option
+@yes_option
+@json_option
+def clear(bench_name: str, yes: bool, as_json: bool) -> None:
+    """Make the controller forget its latched faults; nothing moves."""
+    from fabctl.errors import Stopped
+
+    with _rig(bench_name, "clearing faults") as (rig, _):
+        now = rig.fresh_sample()
+        if not confirm(f"Clear {', '.join(now.faults) or 'no faults'}?", yes):
+            raise Stopped("not cleared")
+        rig.clear_faults()
+        after = rig.fresh_sample()
+    show(_state(after), as_json, [f"{after.state}, faults: {', '.join(after.faults) or 'none'}"])
+
+
+@contextmanager
+def _rig(bench_name: str, purpose: str) -> Iterator[tuple[Indenter, RigConfig]]:
+    """Lend the bench's rig."""
+    from contextlib import closing
+
+    from drivers.rig.indenter import open_indenter
+    from fabctl.bench import open_bench, refuse_without
+    from fabctl.config.bench import load_bench
+    from fabctl.config.rig import load_rig
+
+    place = lab()
+    config = load_bench(bench_name, place.root)
+    refuse_without(config, "rig")
+    assert config.rig is not None
+    registers = load_rig(config.rig.map, place.root)
+    with (
+        open_bench(place, config, purpose) as bench,
+        closing(open_indenter(bench.url("rig"), registers)) as rig,
+    ):
+        yield rig, config.rig
+
+
+def _moved(bench_name: str, word: str, question: str, yes: bool, as_json: bool, begin: Any) -> None:
+    """Ask, arm, move, stop, disarm; the stage is stopped on every way out."""
+    from drivers.rig.indenter import Limits
+    from fabctl.errors import Stopped
+
+    if not confirm(question, yes):
+        raise Stopped("not moved")
+    with _rig(bench_name, f"{word} of the rig") as (rig, config):
+        rig.clear_faults()
+        rig.set_limits(Limits(config.force_limit_N, -2.0, 0.0, config.travel_mm, 0.5, 50.0, 0.5))
+        try:
+            now = rig.fresh_sample()
+            rig.arm()
+            after = rig.wait(begin(rig, now), 120.0)
+        finally:
+            rig.stop()
+            rig.disarm()
+        after = rig.fresh_sample()
+    show(_state(after), as_json, [f"{word}: at {after.position_mm:.3f} mm, {after.force_N:.3f} N gross"])
+
+
+def _sampled(rig: Indenter, time_s: float) -> list[Sample]:
+    from fabctl.clock import WallClock
+
+    clock, found = WallClock(), []
+    until_s = clock.now_s() + time_s
+    while clock.now_s() < until_s:
+        found.append(rig.fresh_sample())
+        clock.sleep(0.01)
+    return found
+
+
+def _state(sample: Sample) -> dict[str, Any]:
+    return {
+        "state": sample.state,
+        "faults": list(sample.faults),
+        "position_mm": sample.position_mm,
+        "force_gross_N": sample.force_N,
+    }

@@ -1,0 +1,122 @@
+"""The rig's calibrations: the load cell against masses, the frame against a rigid block. Fitting is pure.
+
+A bench's current calibration lies in `calibrations/<bench>.json`; each run copies it, so that a result never changes
+because somebody calibrated later.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from design.findings import Finding
+from fabctl.errors import RecordError
+from fabctl.records.folder import as_json, write_atomically
+
+VALID_DAYS = 365
+GRAVITY_N_KG = 9.80665
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A fitted line with the standard errors of slope and offset, and the scatter about it."""
+
+    slope: float
+    slope_se: float
+    offset: float
+    offset_se: float
+    scatter: float
+    degrees_count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What is known of a rig. `gain_ratio` is shown over true force; both figures have a standard error and a date."""
+
+    gain_ratio: float | None = None
+    gain_se_ratio: float | None = None
+    force_run: str | None = None
+    force_utc: str | None = None
+    compliance_mm_N: float | None = None
+    compliance_se_mm_N: float | None = None
+    frame_run: str | None = None
+    frame_utc: str | None = None
+    valid_days_count: int = VALID_DAYS
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON."""
+        return asdict(self)
+
+    def findings(self, now: datetime | None = None) -> list[Finding]:
+        """Return what is missing or past its date."""
+        found = []
+        for what, value, date in (
+            ("load cell", self.gain_ratio, self.force_utc),
+            ("frame", self.compliance_mm_N, self.frame_utc),
+        ):
+            word = "force" if what == "load cell" else "frame"
+            if value is None or date is None:
+                found.append(
+                    Finding(f"RIG-NO-{word.upper()}", f"the {what} is not calibrated", "warning", hint=_hint(word))
+                )
+                continue
+            ends = datetime.fromisoformat(date) + timedelta(days=self.valid_days_count)
+            if (now or datetime.now(UTC)) > ends:
+                text = f"the calibration of the {what} ended on {ends.date()}"
+                found.append(Finding(f"RIG-{word.upper()}-EXPIRED", text, "warning", hint=_hint(word)))
+        return found
+
+
+def _hint(word: str) -> str:
+    return f"fabctl rig calibrate {word}"
+
+
+def fit_line(x: Sequence[float], y: Sequence[float]) -> Line:
+    """Return the least-squares line through at least three points."""
+    if len(x) < 3:
+        raise ValueError(f"{len(x)} points do not show how well a line fits; give at least three")
+    design = np.column_stack([np.asarray(x, float), np.ones(len(x))])
+    (slope, offset), *_ = np.linalg.lstsq(design, np.asarray(y, float), rcond=None)
+    residual = np.asarray(y, float) - design @ [slope, offset]
+    degrees = len(x) - 2
+    variance = float(residual @ residual) / degrees
+    covariance = np.linalg.inv(design.T @ design) * variance
+    return Line(
+        float(slope),
+        float(covariance[0, 0] ** 0.5),
+        float(offset),
+        float(covariance[1, 1] ** 0.5),
+        variance**0.5,
+        degrees,
+    )
+
+
+def calibration_path(home: Path, bench: str) -> Path:
+    """Return where a bench's calibration lies."""
+    return home / "calibrations" / f"{bench}.json"
+
+
+def load_calibration(home: Path, bench: str) -> Calibration | None:
+    """Return the bench's calibration, or None where there is none."""
+    path = calibration_path(home, bench)
+    if not path.is_file():
+        return None
+    try:
+        found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return Calibration(**found)
+    except (ValueError, TypeError) as fault:
+        raise RecordError(f"{path}: not a calibration: {fault}") from fault
+
+
+def save_calibration(home: Path, bench: str, calibration: Calibration) -> Path:
+    """Make `calibration` the bench's current one."""
+    path = calibration_path(home, bench)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, as_json(calibration.as_dict()))
+    return path

@@ -1,0 +1,236 @@
+"""Where the indenter meets the specimen, on a loading curve that begins free.
+
+Estimators made for Hertz's convex start are early by a millimetre on a cap, whose curve rises at once and softens.
+The one that is used here fits the free part and the beginning of the loaded part together,
+
+    F(u) = b0 + b1 u + Σ a_p (u − u0)₊^p,
+
+with p = 1, 2, 3 for a start with a slope, or p = 1.5, 2.5, 3.5 for a Hertzian one where the data clearly ask for it. u0
+is found by scanning the residual, with its standard error. The others are computed to show how far opinions differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Reals = NDArray[np.float64]
+
+SLOPED, HERTZIAN = (1.0, 2.0, 3.0), (1.5, 2.5, 3.5)
+CLEARLY = 12.0  # by how much chi² must fall before a Hertzian start is believed instead of a sloped one
+FREE_MIN = 12  # samples of the free part, for its level and noise
+SIGNAL = 8.0  # the force must exceed the noise by this factor
+MISFIT_SIGMA = 4.0  # a window is too long where chi² exceeds its mean by so many of its standard deviations
+AGREE_SIGMA = 1.5  # and where its contact lies outside so many standard errors of a shorter window's
+DRIFT_N_MM = 2e-3  # how much the free part is expected to slope: drift over speed
+WINDOWS = (0.15, 0.25, 0.4, 0.6, 0.85)  # of the way from the guess to the first maximum
+SE_GOOD_MM = 0.05  # a shorter window this sure may end the search; a less sure one is lengthened in any case
+SE_MAX_MM = 0.25  # a contact less certain than this is not found
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """Where contact is, how sure that is, and what the other estimators say.
+
+    `position_mm` is None where it was not found; `reason` says why. `slope_N_mm` is the stiffness at contact with its
+    standard error; None for a Hertzian start, which has none.
+    """
+
+    position_mm: float | None
+    reason: str = ""
+    se_mm: float | None = None
+    kind: str = ""
+    slope_N_mm: float | None = None
+    slope_se_N_mm: float | None = None
+    noise_N: float = 0.0
+    baseline_N: float = 0.0
+    baseline_N_mm: float = 0.0
+    others_mm: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def spread_mm(self) -> float | None:
+        """Return how far the estimators lie apart."""
+        values = [value for _, value in self.others_mm] + ([] if self.position_mm is None else [self.position_mm])
+        return max(values) - min(values) if len(values) > 1 else None
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """One joint fit of free and loaded part."""
+
+    contact_mm: float
+    powers: tuple[float, ...]
+    coefficients: Reals  # (2 + powers,): level, drift, then a_p
+    covariance: Reals  # (3 + powers, …): contact last
+    se_mm: float
+    chi2: float
+    count: int
+
+
+def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
+    """Return the contact on a loading curve; `position_mm` (n,) rises, the frame's give already taken off."""
+    guess = _guess(position_mm, force_N)
+    if isinstance(guess, str):
+        return Contact(None, guess)
+    start, level_N, noise_N = guess
+    u, f = position_mm, force_N
+    others = _opinions(u, f, start, level_N, noise_N)
+    best = _best_fit(u, f, start, noise_N)
+    if best is None:
+        reason = "no window after the rise is long enough to fit"
+        return Contact(None, reason, noise_N=noise_N, baseline_N=level_N, others_mm=others)
+    se_mm = best.se_mm
+    sloped = best.powers == SLOPED
+    found = Contact(
+        best.contact_mm,
+        se_mm=se_mm,
+        kind="sloped" if sloped else "hertzian",
+        slope_N_mm=float(best.coefficients[2]) if sloped else None,
+        slope_se_N_mm=float(np.sqrt(best.covariance[2, 2])) if sloped else None,
+        noise_N=noise_N,
+        baseline_N=float(best.coefficients[0]),
+        baseline_N_mm=float(best.coefficients[1]),
+        others_mm=others,
+    )
+    if se_mm > SE_MAX_MM:
+        reason = f"the start is too soft for the noise: standard error {se_mm:.2f} mm, more than {SE_MAX_MM:g} mm"
+        return Contact(None, reason, se_mm, noise_N=noise_N, baseline_N=level_N, others_mm=others)
+    return found
+
+
+def _guess(u: Reals, f: Reals) -> tuple[int, float, float] | str:
+    """Return (index of the first sure rise, free level, noise), or why there is none."""
+    if len(u) < 3 * FREE_MIN:
+        return f"only {len(u)} samples in the loading"
+    head = f[:FREE_MIN]
+    noise = max(float(np.std(np.diff(head)) / np.sqrt(2)), 1e-6)
+    if f.max() - np.median(head) < SIGNAL * noise:
+        return f"the force never leaves the noise of {1000 * noise:.1f} mN"
+    # The free part grows as long as the running mean of a few samples stays in its band.
+    width = 8
+    mean = np.convolve(f, np.full(width, 1 / width), "valid")
+    level = float(np.median(head))
+    for _ in range(3):
+        band = 4.5 * noise / np.sqrt(width) + 0.004 * (f.max() - level)
+        over = np.flatnonzero(mean - level > band)
+        if not len(over):
+            return "the force never rises steadily"
+        start = int(over[0])
+        if start < FREE_MIN:
+            return "the curve begins in contact: there is no free part before it"
+        free = f[:start]
+        level = float(np.median(free))
+        noise = max(float(np.std(np.diff(free)) / np.sqrt(2)), 1e-6)
+    return start, level, noise
+
+
+def _best_fit(u: Reals, f: Reals, start: int, noise_N: float) -> Fit | None:
+    """Return the fit over the longest window that the model still follows and that agrees with all shorter ones."""
+    top = start + int(np.argmax(f[start:]))
+    span_mm = float(u[top] - u[start])
+    taken: list[Fit] = []
+    for part in WINDOWS:
+        end = int(np.searchsorted(u, u[start] + part * span_mm))
+        if end - start < 4 * len(SLOPED) and part != WINDOWS[-1]:
+            continue
+        around = (float(u[start]), 2.5, 0.5) if not taken else (taken[-1].contact_mm, 0.6, 0.6)
+        sloped = _scan(u[:end], f[:end], *around, SLOPED, noise_N)
+        hertzian = _scan(u[:end], f[:end], *around, HERTZIAN, noise_N)
+        found = hertzian if _is_hertzian(sloped, hertzian) else sloped
+        misfit = (found.chi2 - found.count) / np.sqrt(2 * found.count)
+        agrees = all(abs(found.contact_mm - shorter.contact_mm) <= AGREE_SIGMA * shorter.se_mm for shorter in taken)
+        if taken and taken[-1].se_mm < SE_GOOD_MM and (misfit > MISFIT_SIGMA or not agrees):
+            break
+        taken.append(found)
+    return taken[-1] if taken else None
+
+
+def _is_hertzian(sloped: Fit, hertzian: Fit) -> bool:
+    """Believe a Hertzian start where it fits clearly better, or as well on a curve that bends upwards at once."""
+    bend, bend_se = sloped.coefficients[3], float(np.sqrt(sloped.covariance[3, 3]))
+    upwards = bend > 3 * bend_se
+    return hertzian.chi2 < sloped.chi2 - CLEARLY or bool(upwards and hertzian.chi2 < sloped.chi2 + 2)
+
+
+def _scan(
+    u: Reals, f: Reals, around_mm: float, before_mm: float, after_mm: float, powers: tuple[float, ...], noise_N: float
+) -> Fit:
+    """Return the least-squares fit over the contact point: a scan, then a refinement by halving."""
+    low = max(float(u[FREE_MIN // 2]), around_mm - before_mm)
+    high = max(min(around_mm + after_mm, float(u[-2 * len(powers)])), low + 0.1)
+    grid = np.linspace(low, high, max(9, round((high - low) / 0.08)))
+    step = grid[1] - grid[0]
+    costs = [_cost(u, f, c, powers, noise_N) for c in grid]
+    # Of a flat valley the curvature at its bottom says too little: what lies within 2σ of the best counts.
+    likely = grid[np.array(costs) < min(costs) + 4 * noise_N**2]
+    valley_mm = float(np.ptp(likely)) / 4
+    middle = float(grid[int(np.argmin(costs))])
+    while step > 1e-3:
+        step /= 2.5
+        trial = [middle + k * step for k in (-2, -1, 0, 1, 2)]
+        costs = [_cost(u, f, c, powers, noise_N) for c in trial]
+        middle = trial[int(np.argmin(costs))]
+    return _fit_at(u, f, middle, powers, noise_N, valley_mm)
+
+
+def _fit_at(u: Reals, f: Reals, contact_mm: float, powers: tuple[float, ...], noise_N: float, valley_mm: float) -> Fit:
+    design, wanted = _system(u, f, contact_mm, powers, noise_N)
+    coefficients = np.linalg.lstsq(design, wanted, rcond=None)[0].astype(np.float64)
+    residual = wanted - design @ coefficients
+    away = np.maximum(u - contact_mm, 1e-9)
+    slope = sum(-a * p * away ** (p - 1) * (u > contact_mm) for a, p in zip(coefficients[2:], powers, strict=True))
+    jacobian = np.column_stack([design, np.append(slope, 0.0)])
+    covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13) * noise_N**2
+    se_mm = max(float(np.sqrt(covariance[-1, -1])), valley_mm)
+    return Fit(contact_mm, powers, coefficients, covariance, se_mm, float(residual @ residual) / noise_N**2, len(u))
+
+
+def _system(u: Reals, f: Reals, contact_mm: float, powers: Sequence[float], noise_N: float) -> tuple[Reals, Reals]:
+    """Return columns and right side; a last row expects the free part to slope by no more than the drift."""
+    away = np.maximum(u - contact_mm, 0.0)
+    design = np.zeros((len(u) + 1, 2 + len(powers)))
+    design[:-1, 0] = 1.0
+    design[:-1, 1] = u - contact_mm
+    for k, power in enumerate(powers):
+        design[:-1, 2 + k] = away**power
+    design[-1, 1] = noise_N / DRIFT_N_MM
+    return design, np.append(f, 0.0)
+
+
+def _cost(u: Reals, f: Reals, contact_mm: float, powers: Sequence[float], noise_N: float) -> float:
+    design, wanted = _system(u, f, contact_mm, powers, noise_N)
+    # Normal equations: four times faster than an orthogonal solution, and the columns are scaled to keep them sound.
+    scaled = design / (np.sqrt((design**2).sum(axis=0)) + 1e-300)
+    weights = np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(scaled.shape[1]), scaled.T @ wanted)
+    residual = wanted - scaled @ weights
+    return float(residual @ residual)
+
+
+def _opinions(u: Reals, f: Reals, start: int, level_N: float, noise_N: float) -> tuple[tuple[str, float], ...]:
+    """Return what the usual estimators say: none of them is used, their spread is shown."""
+    found: dict[str, float] = {}
+    over = np.flatnonzero(f - level_N > 5 * noise_N)
+    runs = over[np.flatnonzero(np.diff(over, append=over[-1:] + 1) == 1)] if len(over) else over
+    if len(runs):
+        found["threshold"] = float(u[runs[0]])
+    top = start + int(np.argmax(f[start:]))
+    low, high = level_N + 0.2 * (f[top] - level_N), level_N + 0.5 * (f[top] - level_N)
+    part = np.flatnonzero((f[start:top] > low) & (f[start:top] < high)) + start
+    if len(part) >= 3 and np.ptp(u[part]) > 0:
+        slope, offset = np.polyfit(u[part], f[part], 1)
+        if slope > 0:
+            found["tangent"] = float((level_N - offset) / slope)
+    rise = np.maximum(f[start:top] - level_N, 0.0) ** (2 / 3)
+    if len(rise) >= 6:
+        slope, offset = np.polyfit(u[start:top], rise, 1)
+        if slope > 0:
+            found["hertz"] = float(-offset / slope)
+    width = max(6, start // 6)
+    if width + 2 < top - width:
+        centres = np.arange(width, top - width)
+        ratio = [np.var(f[k : k + width]) / (np.var(f[k - width : k]) + noise_N**2 / 10) for k in centres]
+        found["variance_ratio"] = float(u[centres[int(np.argmax(ratio))]])
+    return tuple(sorted(found.items()))

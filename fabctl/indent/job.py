@@ -1,0 +1,261 @@
+"""An indentation job: plan, check, execute, summarise. Only `execute` meets the rig."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from design.findings import Finding, errors
+from drivers.errors import DeviceError
+from drivers.rig.indenter import Identity, open_indenter
+from drivers.rig.registers import RegisterMap
+from fabctl.bench import Bench, refuse_without
+from fabctl.clock import Clock, WallClock
+from fabctl.config.bench import BenchConfig, RigConfig, find
+from fabctl.config.method import MethodConfig, load_method
+from fabctl.config.rig import load_rig
+from fabctl.errors import FabctlError, RefusedError, Stopped
+from fabctl.events import Emit, Event, silent
+from fabctl.indent.analysis import summarise_run
+from fabctl.indent.calibration import Calibration, load_calibration
+from fabctl.indent.method import Action, Predicted, actions, check, read_predicted, time_s
+from fabctl.indent.recorder import Recorder
+from fabctl.indent.run import Ending, Runner, Wish, resumed
+from fabctl.records.folder import RunFolder, start_run
+from fabctl.workspace import Specimen, Workspace
+
+
+@dataclass(frozen=True)
+class IndentPlan:
+    """A test, decided but not begun."""
+
+    specimen: Specimen
+    method: MethodConfig
+    method_path: Path
+    rig: RigConfig
+    registers: RegisterMap
+    map_path: Path
+    actions: tuple[Action, ...]
+    predicted: Predicted | None
+    calibration: Calibration | None
+    sample_hz: float
+    findings: tuple[Finding, ...]
+    resumes: str | None = None
+
+    @property
+    def time_s(self) -> float:
+        """Return about how long it takes."""
+        return time_s(self.actions, self.method.travel_speed_mm_s)
+
+    @property
+    def predicted_peak_N(self) -> float | None:
+        """Return the greatest force the design foresees on this plan."""
+        depths = [a.depth_mm for a in self.actions if a.kind == "load" and a.depth_mm is not None]
+        return self.predicted.peak_N(max(depths)) if self.predicted is not None and depths else None
+
+
+@dataclass(frozen=True)
+class Steering:
+    """What the operator may do while it runs: `wish` says go, pause or stop; `go_on` ends a wait step."""
+
+    wish: Callable[[], Wish] = lambda: "go"
+    go_on: Callable[[str], bool] = lambda _message: True
+
+
+def plan_test(
+    lab: Workspace, specimen: Specimen, method: str, bench: BenchConfig, resume: RunFolder | None = None
+) -> IndentPlan:
+    """Return what would be done, with everything that speaks against it; touches no device."""
+    refuse_without(bench, "rig")
+    assert bench.rig is not None
+    read, registers = load_method(method, lab.root), load_rig(bench.rig.map, lab.root)
+    steps = actions(read)
+    findings: list[Finding] = []
+    if resume is not None:
+        findings += _against_resuming(resume, specimen, read, steps)
+        steps = resumed(steps, curves_done(resume))
+        if not steps:
+            findings.append(Finding("METHOD-DONE", "every curve of that run is done", where=resume.run_id))
+    response = specimen.design / "response.csv"
+    predicted = read_predicted(response) if response.is_file() else None
+    calibration = load_calibration(lab.root, bench.name)
+    findings += check(steps, read, bench.rig, predicted, "move_stage" in registers.commands)
+    findings += calibration.findings() if calibration is not None else _uncalibrated(bench.name)
+    return IndentPlan(
+        specimen,
+        read,
+        find("methods", method, lab.root),
+        bench.rig,
+        registers,
+        find("rigs", bench.rig.map, lab.root),
+        steps,
+        predicted,
+        calibration,
+        read.sample_hz or bench.rig.sample_hz,
+        tuple(findings),
+        resume.run_id if resume is not None else None,
+    )
+
+
+def refuse(plan: IndentPlan) -> None:
+    """Raise `RefusedError` where an error stands against the plan."""
+    against = errors(plan.findings)
+    if against:
+        raise RefusedError(f"{plan.specimen.name}: method {plan.method.name} is refused", against)
+
+
+def run_test(
+    lab: Workspace,
+    plan: IndentPlan,
+    bench: Bench,
+    emit: Emit = silent,
+    steering: Steering | None = None,
+    facts: Mapping[str, Any] | None = None,
+    clock: Clock | None = None,
+) -> RunFolder:
+    """Carry the plan out and return its run, closed; a run that went wrong is closed as such, and the error raised."""
+    refuse(plan)
+    bench.lay(plan.specimen.design)
+    with contextlib.closing(open_indenter(bench.url("rig"), plan.registers)) as rig:
+        identity = rig.identify()
+        _refuse_rig(plan, identity)
+        config = _config(plan, identity, {**rig.environment(), **(facts or {})})
+        inputs = [plan.method_path, plan.map_path]
+        inputs += [p for p in (plan.specimen.design / "response.csv",) if p.is_file()]
+        run = start_run(lab.runs, "indent", specimen=plan.specimen.name, inputs=inputs, config=config)
+        log = run.log_events()
+        both = _both(log, emit)
+        emit(Event("stage", f"run {run.run_id}"))
+        try:
+            recorder = Recorder(run.path / "samples.csv")
+            try:
+                runner = Runner(
+                    rig,
+                    plan.method,
+                    plan.actions,
+                    recorder,
+                    clock or WallClock(),
+                    plan.sample_hz,
+                    both,
+                    (steering or Steering()).wish,
+                    (steering or Steering()).go_on,
+                )
+                ending = runner.execute()
+            finally:
+                recorder.close()
+        except (Stopped, KeyboardInterrupt) as fault:
+            run.finish("stopped", str(fault) or "stopped by the operator")
+            raise
+        except (DeviceError, FabctlError) as fault:
+            run.finish("failed", str(fault))
+            raise
+    run.write_result(result_of(run, plan, ending))
+    run.finish("done")
+    return run
+
+
+def result_of(run: RunFolder, plan: IndentPlan, ending: Ending) -> dict[str, Any]:
+    """Return the run's figures, with how the sampling went and every warning that holds for them."""
+    body = summarise_run(run)
+    body |= {
+        "rows_count": ending.rows_count,
+        "lost_replies_count": ending.lost_count,
+        "tares_N": ending.tares_N,
+        "findings": [f.as_dict() for f in plan.findings],
+        "predicted_secant_N_mm": None,
+    }
+    if plan.predicted is not None and plan.predicted.depth_mm[-1] >= plan.method.secant_mm:
+        body["predicted_secant_N_mm"] = plan.predicted.secant_N_mm(plan.method.secant_mm)
+    return body
+
+
+def curves_done(run: RunFolder) -> list[tuple[int, int]]:
+    """Return (point, curve) of every curve that a run finished, from its events."""
+    import json
+
+    found = []
+    path = run.path / "events.jsonl"
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
+        with contextlib.suppress(ValueError, KeyError):  # a last line may be cut short
+            event = json.loads(line)
+            if event["kind"] == "curve":
+                found.append((int(event["data"]["point"]), int(event["data"]["curve"])))
+    return found
+
+
+def _against_resuming(
+    run: RunFolder, specimen: Specimen, method: MethodConfig, steps: tuple[Action, ...]
+) -> list[Finding]:
+    manifest = run.manifest()
+    found = []
+    if manifest.get("kind") != "indent" or manifest.get("specimen") != specimen.name:
+        found.append(Finding("RESUME-OTHER", f"{run.run_id} is not a test of {specimen.name}"))
+    if manifest.get("config", {}).get("method") != method.model_dump(mode="json"):
+        found.append(Finding("RESUME-METHOD", "the method has changed since", hint="run it from the beginning"))
+    outcome = run.outcome()
+    if outcome is not None and outcome["status"] == "done":
+        found.append(Finding("RESUME-DONE", f"{run.run_id} came to its end"))
+    return found
+
+
+def _uncalibrated(bench: str) -> list[Finding]:
+    return [
+        Finding(
+            "RIG-UNCALIBRATED",
+            f"bench {bench} has no calibration: forces are the controller's, the frame's give is not removed",
+            "warning",
+            hint="fabctl rig calibrate force, then fabctl rig calibrate frame",
+        )
+    ]
+
+
+def _refuse_rig(plan: IndentPlan, identity: Identity) -> None:
+    found = []
+    if plan.method.limits.force_N > identity.capacity_N:
+        found.append(
+            Finding(
+                "RIG-CAPACITY",
+                f"the limit {plan.method.limits.force_N:g} N is above the load cell's {identity.capacity_N:g} N",
+            )
+        )
+    if plan.method.limits.travel_mm > identity.travel_mm:
+        found.append(
+            Finding("RIG-TRAVEL", f"travel {plan.method.limits.travel_mm:g} mm, the rig has {identity.travel_mm:g} mm")
+        )
+    fastest = max((a.speed_mm_s for a in plan.actions), default=0.0)
+    if max(fastest, plan.method.travel_speed_mm_s) > identity.speed_max_mm_s:
+        found.append(
+            Finding("RIG-SPEED", f"a step asks for {fastest:g} mm/s, the rig reaches {identity.speed_max_mm_s:g} mm/s")
+        )
+    if found:
+        raise RefusedError(f"{identity.model} cannot run method {plan.method.name}", found)
+
+
+def _config(plan: IndentPlan, identity: Identity, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is frozen into the run: method, plan, rig, calibration, and the conditions."""
+    record = plan.specimen.record()
+    known = {key: record[key] for key in ("thickness_mm", "batch", "rest_h", "deployed_utc") if key in record}
+    return {
+        "method": plan.method.model_dump(mode="json"),
+        "plan": [asdict(action) for action in plan.actions],
+        "rig": {**asdict(identity), "map": plan.registers.name, "indenter_radius_mm": plan.rig.indenter_radius_mm},
+        "sample_hz": plan.sample_hz,
+        "calibration": plan.calibration.as_dict() if plan.calibration is not None else None,
+        "conditions": {**known, **facts},
+        "resumes": plan.resumes,
+        "findings": [finding.as_dict() for finding in plan.findings],
+    }
+
+
+def _both(log: Callable[[Event], None], emit: Emit) -> Emit:
+    """Return a listener for both; what only the screen wants is not logged."""
+
+    def hear(event: Event) -> None:
+        if event.kind != "progress":
+            log(event)
+        emit(event)
+
+    return hear
