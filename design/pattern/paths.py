@@ -21,6 +21,10 @@ class CutPath:
     closed: bool = False
     cell: int | None = None  # the cell it belongs to, where there is one
 
+    def is_half_slit(self) -> bool:
+        """A slit across an edge has three or five points; one of two begins inside and ends open, on the border."""
+        return self.layer == "slit" and not self.closed and len(self.points_mm) == 2
+
 
 @dataclass(frozen=True, slots=True)
 class LayerPreset:
