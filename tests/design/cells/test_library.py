@@ -1,0 +1,68 @@
+"""The shipped library against the paper's published figures, and what it refuses to answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design.cells.geometry import strip_mm
+from design.cells.library import CellLibrary, LibraryError, load_library
+from design.cells.sheet import Sheet
+
+
+@pytest.fixture(scope="module")
+def library() -> CellLibrary:
+    return load_library()
+
+
+def comparable(rows: np.ndarray) -> np.ndarray:
+    strip = np.array([strip_mm(10 * t, theta, Sheet()) for t, theta in rows[:, :2]]) / 10
+    return (strip > 0.01) & (rows[:, 3] > 0.3) & (rows[:, 1] <= 0.26)
+
+
+def test_the_interpolated_map_agrees_with_the_published_one(library: CellLibrary, shared: Path) -> None:
+    rows = np.genfromtxt(shared / "published/cell_library_half.csv", delimiter=",", skip_header=1)
+    rows = rows[comparable(rows)]
+    assert len(rows) == 3148
+    cells = library.at(10 * rows[:, 0], rows[:, 1])
+    assert cells.inside.mean() > 0.995
+    rows, inside = rows[cells.inside], cells.inside
+    error = np.abs(cells.expansion_ratio[inside] - rows[:, 2])
+    assert np.median(error) < 0.0015 and np.quantile(error, 0.99) < 0.004
+    ratio = cells.stiffness_mJ[inside] / rows[:, 4]
+    scale = np.median(ratio)
+    assert np.quantile(np.abs(ratio / scale - 1), 0.95) < 0.04
+    assert np.quantile(np.abs(cells.barrier_mJ[inside] / rows[:, 3] / scale - 1), 0.95) < 0.12
+
+
+def test_a_point_on_the_grid_is_given_back_exactly(library: CellLibrary) -> None:
+    some = slice(None, None, 37)
+    cells = library.at(library.t_mm[some], library.theta_rad[some])
+    np.testing.assert_allclose(cells.expansion_ratio, library.expansion_ratio[some], rtol=1e-9)
+    np.testing.assert_allclose(cells.Y_N_mm, library.Y_N_mm[some], rtol=1e-9)
+
+
+def test_outside_the_map_there_is_no_number(library: CellLibrary) -> None:
+    cells = library.at(np.array([5.0, 0.5, 1.0]), np.array([0.0, 0.5, 1.0]))
+    assert not cells.inside.any() and np.isnan(cells.expansion_ratio).all()
+
+
+def test_a_stiffer_thicker_sheet_scales_energies_only(library: CellLibrary) -> None:
+    other = library.scaled(replace(library.sheet, E_MPa=3.0, thickness_mm=4.6))
+    np.testing.assert_allclose(other.barrier_mJ, 4 * library.barrier_mJ)
+    np.testing.assert_allclose(other.expansion_ratio, library.expansion_ratio)
+
+
+def test_another_hinge_needs_another_library(library: CellLibrary) -> None:
+    with pytest.raises(LibraryError, match="build one"):
+        library.scaled(replace(library.sheet, hinge_mm=0.5))
+
+
+def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cells.npz"
+    path.write_bytes(b"no")
+    with pytest.raises(LibraryError, match="not a library"):
+        load_library(path)
