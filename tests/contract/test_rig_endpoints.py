@@ -6,6 +6,7 @@ import contextlib
 import shutil
 import subprocess
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -41,7 +42,7 @@ def test_a_guarded_move_stops_at_its_force_and_every_sample_is_new(rig: tuple[In
     assert loaded
     # The spring of every endpoint: 0.5 N/mm from 8 mm on.
     assert all(s.force_N == pytest.approx(0.5 * (s.position_mm - 8.0), abs=2e-3) for s in loaded)
-    assert all(b.sequence > a.sequence for a, b in zip(heard, heard[1:], strict=False))
+    assert all(b.sequence > a.sequence for a, b in pairwise(heard))
     assert indenter.stop()
 
 
