@@ -10,7 +10,7 @@ DEVICES = {
     "grbl": "simulators.grbl.main",
     "rig": "simulators.rig.program",
     "scanner": "simulators.scanner",
-    "camera": "simulators.camera",
+    "camera": "simulators.camera.main",
 }
 
 
