@@ -1,0 +1,336 @@
+"""`fabctl camera`: boards, lens calibration, bed alignment, and finding a sheet on the bed."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fabctl.cli.common import bench_option, json_option, lab, say, show
+
+if TYPE_CHECKING:
+    from design.pattern.paths import CutPath
+    from drivers.camera import Frame
+    from fabctl.config.bench import BenchConfig
+    from fabctl.vision.boards import Charuco, MarkSheet
+
+PATH = click.Path(path_type=Path)
+FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+image_option = click.option("--image", type=FILE, help="A picture of the bed, instead of the bench's camera.")
+
+
+def size(text: str) -> tuple[float, float]:
+    """Return both numbers of `200x150`."""
+    w, h = (float(part) for part in text.lower().split("x"))
+    if not (w > 0 and h > 0):
+        raise ValueError(text)
+    return w, h
+
+
+@click.group("camera")
+def command() -> None:
+    """Boards, lens calibration and bed alignment."""
+
+
+@command.group("board")
+def board() -> None:
+    """Make boards to print or engrave, and note what the print measures."""
+
+
+@board.command("charuco")
+@click.option("--squares", type=size, metavar="WxH", default="10x7", show_default=True, help="Columns and rows.")
+@click.option("--square-mm", type=float, default=20.0, show_default=True)
+@click.option("--marker-mm", type=float, default=15.0, show_default=True)
+@click.option("--name", default="lens", show_default=True)
+@json_option
+def charuco(squares: tuple[float, float], square_mm: float, marker_mm: float, name: str, as_json: bool) -> None:
+    """Make a ChArUco board for the lens."""
+    from fabctl.vision.boards import CHARUCO_IDS, Charuco
+
+    columns, rows = int(squares[0]), int(squares[1])
+    if not 0 < marker_mm < square_mm or min(columns, rows) < 3 or columns * rows // 2 > len(CHARUCO_IDS):
+        limit = 2 * len(CHARUCO_IDS)
+        raise click.UsageError(f"markers must be smaller than squares, and squares 3x3 at least and {limit} at most")
+    _write_board(Charuco(name, columns, rows, square_mm, marker_mm), as_json)
+
+
+@board.command("marks")
+@click.argument("kind", type=click.Choice(["bed", "registration", "scale"]))
+@click.option(
+    "--size-mm", type=size, metavar="WxH", required=True, help="The bed's travel, or the sheet's width and height."
+)
+@click.option("--side-mm", type=float, default=None, help="Side of a mark's black square.")
+@click.option("--name", default=None, help="The board's name; its kind where none is given.")
+@json_option
+def marks(kind: str, size_mm: tuple[float, float], side_mm: float | None, name: str | None, as_json: bool) -> None:
+    """Make a sheet of marks: for the bed's alignment, in a sheet's corners, or around a specimen."""
+    from dataclasses import replace
+
+    from fabctl.vision import boards
+
+    side = side_mm or {"bed": 12.0, "registration": 8.0, "scale": 15.0}[kind]
+    sheet = (
+        boards.bed_marks(size_mm, side)
+        if kind == "bed"
+        else boards.registration_marks(size_mm, side)
+        if kind == "registration"
+        else boards.scale_marks(size_mm, side)
+    )
+    _write_board(replace(sheet, name=name or kind), as_json)
+
+
+@board.command("measured")
+@click.argument("name")
+@click.argument("across_mm", type=float)
+@click.argument("up_mm", type=float)
+@json_option
+def measured(name: str, across_mm: float, up_mm: float, as_json: bool) -> None:
+    """Note what the two rulers of the print measure; printers scale."""
+    from fabctl.config.boards import load_board, write_board
+
+    config = load_board(name, lab().root)
+    changed = type(config).model_validate({**config.model_dump(), "measured_mm": (across_mm, up_mm)})
+    path = lab().root / "configs" / "boards" / f"{config.name}.yaml"
+    write_board(changed, path)
+    x, y = changed.ratios()
+    data = {"board": config.name, "file": str(path), "ratio": [x, y]}
+    show(data, as_json, [f"{path}: {x:.5f} of its drawn size across, {y:.5f} up"])
+
+
+def _write_board(made: Charuco | MarkSheet, as_json: bool) -> None:
+    from fabctl.config.boards import config_of, write_board
+    from fabctl.records.folder import write_atomically
+    from fabctl.vision.boards import Charuco, hatch, sheet_ink
+    from fabctl.vision.drawing import drawing_of, dxf, pdf
+
+    folder = lab().root / "configs" / "boards"
+    folder.mkdir(parents=True, exist_ok=True)
+    drawing = drawing_of(made)
+    strokes = [] if isinstance(made, Charuco) else hatch(sheet_ink(made), 0.1, 0.1)
+    files = {kind: folder / f"{made.name}.{kind}" for kind in ("yaml", "pdf", "dxf")}
+    write_board(config_of(made), files["yaml"])
+    files["pdf"].write_bytes(pdf(drawing))
+    write_atomically(files["dxf"], dxf(drawing, strokes))
+    w, h = made.size_mm
+    lines = [f"{path}" for path in files.values()]
+    lines.append(f"print at 100 %, measure the rulers ({w:g} and {h:g} mm drawn), then:")
+    lines.append(f"fabctl camera board measured {made.name} ACROSS_MM UP_MM")
+    show({"board": made.name, "size_mm": [w, h], "files": {k: str(p) for k, p in files.items()}}, as_json, lines)
+
+
+@command.command("show")
+@bench_option
+@click.option("-o", "--output", type=PATH, default=Path("bed.png"), show_default=True)
+@json_option
+def show_picture(bench_name: str, output: Path, as_json: bool) -> None:
+    """Take one picture of the bed and say whether it can be measured in."""
+    from fabctl.vision.overlay import write_picture
+    from fabctl.vision.quality import picture_findings
+
+    frame = _picture(bench_name, None)
+    write_picture(str(output), frame.image)
+    found = picture_findings(frame.image, frame.source)
+    h, w = frame.image.shape
+    data = {"picture": str(output), "size_px": [w, h], "findings": [f.as_dict() for f in found]}
+    show(data, as_json, [f"{output}: {w} x {h} px", *map(str, found)])
+
+
+@command.command("calibrate")
+@click.argument("pictures", nargs=-1, type=FILE)
+@click.option("--board", "board_name", default="lens", show_default=True, help="Board file or its name.")
+@click.option("--views", default=15, show_default=True, help="How many pictures to take from the live camera.")
+@bench_option
+@json_option
+def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_name: str, as_json: bool) -> None:
+    """Measure the lens from PICTURES of a ChArUco board, or from the bench's camera."""
+    from drivers.camera import read_picture
+    from fabctl.config.boards import load_board
+    from fabctl.errors import UsageError
+    from fabctl.vision import lens
+    from fabctl.vision.bed import lens_path
+
+    config = load_board(board_name, lab().root)
+    if config.kind != "charuco":
+        raise UsageError(f"{board_name} is a sheet of marks; the lens needs a ChArUco board")
+    if config.measured_mm is None:
+        say(f"{board_name}: not measured after printing; the lens does not mind, distances would")
+    bench, state = _bench(bench_name)
+    frames = [read_picture(path) for path in pictures] or _live(bench, state, views)
+    seen = [lens.find_board(frame.image, config.charuco(), frame.source) for frame in frames]
+    for _, found in seen:
+        for finding in found:
+            say(str(finding))
+    sizes = {frame.image.shape for frame in frames}
+    if len(sizes) != 1:
+        raise UsageError(f"the pictures have {len(sizes)} sizes; a lens is measured at one")
+    h, w = sizes.pop()
+    good = [view for view, _ in seen if view is not None]
+    made = lens.calibrate(good, (w, h), config.charuco(), datetime.now(UTC).isoformat())
+    path = lens_path(state, bench.camera.calibration if bench.camera else None)
+    lens.write_lens(made.lens, path, {"views": dict(zip(made.sources, made.view_rms_px, strict=True))})
+    facts = made.lens
+    data = {
+        "lens": str(path),
+        "views_count": facts.views_count,
+        "rms_px": facts.rms_px,
+        "repeat_px": facts.repeat_px,
+        "coverage_ratio": facts.coverage_ratio,
+        "view_rms_px": dict(zip(made.sources, made.view_rms_px, strict=True)),
+    }
+    text = f"{facts.views_count} pictures, residual {facts.rms_px:.3f} px rms, halves agree to {facts.repeat_px:.3f} px"
+    show(data, as_json, [f"{path}: {text}, {facts.coverage_ratio:.0%} of the frame seen"])
+
+
+@command.command("align")
+@click.option("--marks", "marks_name", default="bed", show_default=True, help="Marks at known machine places.")
+@click.option("--offset-mm", type=float, nargs=2, default=(0.0, 0.0), help="Where the marks' own origin lies.")
+@click.option("--height-mm", type=float, default=0.0, help="Of the marks over the bed: the sheet's thickness.")
+@image_option
+@bench_option
+@json_option
+def align(
+    marks_name: str,
+    offset_mm: tuple[float, float],
+    height_mm: float,
+    image: Path | None,
+    bench_name: str,
+    as_json: bool,
+) -> None:
+    """Learn where machine millimetres are in the bed picture, from marks at known places."""
+    from fabctl.config.boards import load_board, with_offset
+    from fabctl.vision import align as aligning
+    from fabctl.vision.bed import alignment_path, lens_path
+    from fabctl.vision.lens import read_lens
+    from fabctl.vision.overlay import error_map, write_picture
+
+    sheet = with_offset(load_board(marks_name, lab().root).mark_sheet(), *offset_mm)
+    bench, state = _bench(bench_name)
+    glass = read_lens(lens_path(state, bench.camera.calibration if bench.camera else None))
+    frame = _picture(bench_name, image)
+    made = aligning.align(frame.image, frame.source, sheet, glass, datetime.now(UTC).isoformat(), height_mm)
+    path = alignment_path(state)
+    aligning.write_alignment(made, path)
+    picture = path.with_suffix(".png")
+    write_picture(str(picture), error_map(frame.image, made))
+    data = {
+        "alignment": str(path),
+        "error_map": str(picture),
+        "marks_count": len(made.witnesses),
+        "rms_mm": made.rms_mm,
+        "worst_mm": made.worst_mm,
+        "mark_error_mm": {witness.id: witness.error_mm for witness in made.witnesses},
+    }
+    text = f"{len(made.witnesses)} marks, each put by the others to {made.rms_mm:.3f} mm rms, {made.worst_mm:.3f} worst"
+    show(data, as_json, [f"{path}: {text}", f"{picture}: the error map"])
+
+
+@command.command("check")
+@image_option
+@bench_option
+@json_option
+def check(image: Path | None, bench_name: str, as_json: bool) -> None:
+    """Say whether the alignment is young enough and its marks are seen where they were."""
+    from fabctl.vision.align import witness_drift_mm
+    from fabctl.vision.bed import checked_alignment
+
+    _, state = _bench(bench_name)
+    frame = _picture(bench_name, image)
+    alignment, found = checked_alignment(state, frame)
+    drift = witness_drift_mm(frame.image, alignment)
+    data = {"drift_mm": drift, "made_utc": alignment.made_utc, "findings": [f.as_dict() for f in found]}
+    worst = max(drift.values())
+    show(data, as_json, [f"{len(drift)} marks in place, the worst {worst:.3f} mm off; aligned {alignment.made_utc}"])
+
+
+@command.command("register")
+@click.option("--sheet", "sheet_name", default="registration", show_default=True, help="The sheet's marks.")
+@click.option("--thickness-mm", type=float, required=True, help="The sheet's: its marks lie that far over the bed.")
+@click.option("--design", type=PATH, default=None, help="Design folder whose job is drawn and checked.")
+@click.option("-o", "--output", type=PATH, default=Path("registration.json"), show_default=True)
+@image_option
+@bench_option
+@json_option
+def register(
+    sheet_name: str,
+    thickness_mm: float,
+    design: Path | None,
+    output: Path,
+    image: Path | None,
+    bench_name: str,
+    as_json: bool,
+) -> None:
+    """Find a sheet with registration marks on the bed, for `fabctl cut run --origin camera`."""
+    from fabctl.config.boards import load_board
+    from fabctl.vision import register as registering
+    from fabctl.vision.bed import find_sheet
+    from fabctl.vision.overlay import write_picture
+
+    sheet = load_board(sheet_name, lab().root).mark_sheet()
+    _, state = _bench(bench_name)
+    job = tuple(read_paths(design / "paths.json")) if design else ()
+    found = find_sheet(state, _picture(bench_name, image), sheet, thickness_mm, job)
+    made = found.registration
+    overlay = output.with_suffix(".png")
+    write_picture(str(overlay), found.overlay)
+    more = {"overlay": str(overlay), "findings": [finding.as_dict() for finding in found.findings]}
+    registering.write_registration(made, output, **more, bench=bench_name)
+    x, y = made.stretch_ratio
+    text = f"{made.marks_count} marks, {made.rms_mm:.3f} mm rms, turned {made.turn_rad:.4f} rad, {x:.4f} x {y:.4f} long"
+    data = {**registering.registration_data(made), **more, "registration": str(output)}
+    show(data, as_json, [f"{output}: {text}", f"{overlay}: the job on the bed", *map(str, found.findings)])
+
+
+def read_paths(path: Path) -> list[CutPath]:
+    """Return the strokes of a design folder's `paths.json`."""
+    import numpy as np
+
+    from design.pattern.paths import CutPath
+    from fabctl.errors import BundleError
+
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["paths"]
+        return [
+            CutPath(row["layer"], np.array(row["points_mm"], dtype=float), bool(row["closed"]), row.get("cell"))
+            for row in rows
+        ]
+    except OSError as fault:
+        raise BundleError(f"{path}: {fault.strerror}") from fault
+    except (KeyError, TypeError, ValueError) as fault:
+        raise BundleError(f"{path}: not the strokes of a design: {fault}") from fault
+
+
+def _bench(name: str) -> tuple[BenchConfig, Path]:
+    from fabctl.config.bench import load_bench
+
+    config = load_bench(name, lab().root)
+    return config, lab().bench_state(config.name)
+
+
+def _picture(bench_name: str, image: Path | None) -> Frame:
+    from drivers.camera import read_picture, snapshot
+
+    return read_picture(image) if image is not None else snapshot(_camera_url(*_bench(bench_name)))
+
+
+def _camera_url(bench: BenchConfig, state: Path) -> str:
+    from fabctl.bench import resolve
+    from fabctl.errors import UsageError
+
+    if bench.camera is None:
+        raise UsageError(f"bench {bench.name} has no camera; add one to its file, or give pictures")
+    return resolve(bench.camera.url, bench.name, state)
+
+
+def _live(bench: BenchConfig, state: Path, count: int) -> list[Frame]:
+    from drivers.camera import open_camera
+
+    frames: list[Frame] = []
+    with open_camera(_camera_url(bench, state)) as camera:
+        left = camera.remaining()
+        for number in range(count if left is None else min(count, left)):
+            say(f"picture {number + 1} of {count}: hold the board another way")
+            frames.append(camera.read())
+    return frames

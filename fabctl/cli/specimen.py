@@ -1,0 +1,104 @@
+"""`fabctl specimen`: the sheets that were cut, facts about them, and reading an engraved id."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fabctl.cli.common import json_option, lab, show
+
+FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+
+
+@click.group("specimen")
+def command() -> None:
+    """List specimens, note facts, read an engraved id."""
+
+
+@command.command("list")
+@json_option
+def list_specimens(as_json: bool) -> None:
+    """List the specimens with the runs of each."""
+    place = lab()
+    names = sorted(p.parent.name for p in place.specimens.glob("S-*/specimen.json"))
+    runs = place.all_runs()
+    kinds = {name: [r.manifest()["kind"] for r in runs if r.manifest().get("specimen") == name] for name in names}
+    rows = [{**place.specimen(name).record(), "runs": kinds[name]} for name in names]
+    lines = [f"{row['id']}  {row['made_utc'][:16]}  {', '.join(row['runs']) or 'no runs'}" for row in rows]
+    show({"specimens": rows}, as_json, lines or ["no specimens yet; `fabctl cut run` gives the first id"])
+
+
+@command.command("show")
+@click.argument("name")
+@json_option
+def show_specimen(name: str, as_json: bool) -> None:
+    """Show what is written about a specimen, and its runs."""
+    from fabctl.records.folder import status_of
+
+    place = lab()
+    record = place.specimen(name).record()
+    runs = [{"run": r.run_id, "status": status_of(r)} for r in place.runs_of(name)]
+    lines = [f"{key}: {value}" for key, value in record.items()] + [f"{r['run']}: {r['status']}" for r in runs]
+    show({**record, "runs": runs}, as_json, lines)
+
+
+@command.command("note")
+@click.argument("name")
+@click.argument("facts", nargs=-1, required=True, metavar="KEY=VALUE…")
+@json_option
+def note(name: str, facts: tuple[str, ...], as_json: bool) -> None:
+    """Write facts about a specimen: thickness_mm=2.31 batch=B7."""
+    specimen = lab().specimen(name)
+    parsed = dict(_fact(text) for text in facts)
+    specimen.note(**parsed)
+    show(specimen.record(), as_json, [f"{name}: noted {', '.join(parsed)}"])
+
+
+def _fact(text: str) -> tuple[str, Any]:
+    key, sign, value = text.partition("=")
+    if not sign or not key.isidentifier():
+        raise click.UsageError(f"{text!r} is not KEY=VALUE")
+    if key in ("id", "made_utc", "design"):
+        raise click.UsageError(f"{key} was given at the cut and stays")
+    try:
+        number = json.loads(value)
+    except ValueError:
+        return key, value
+    # NaN and Infinity pass json.loads, and a record must not hold them.
+    return key, value if isinstance(number, float) and number - number != 0 else number
+
+
+@command.command("read")
+@click.argument("image", type=FILE)
+@json_option
+def read(image: Path, as_json: bool) -> None:
+    """Read the engraved ids in a picture, and say which runs they have."""
+    from design.findings import Finding, errors
+    from drivers.camera import read_picture
+    from fabctl.errors import RefusedError
+    from fabctl.vision.ids import read_ids
+    from fabctl.vision.quality import picture_findings
+
+    frame = read_picture(image)
+    found = picture_findings(frame.image, frame.source)
+    ids = [] if errors(found) else read_ids(frame.image)
+    if not ids:
+        hint = "nearer (3 px a module at least), sharper, less tilted, no glare"
+        none = (
+            [] if errors(found) else [Finding("ID-NONE", "no specimen id in the picture", where=str(image), hint=hint)]
+        )
+        raise RefusedError(f"{image}: nothing to read", [*found, *none])
+    place = lab()
+    rows = []
+    for engraved in ids:
+        known = (place.specimens / engraved.specimen / "specimen.json").is_file()
+        runs = [run.run_id for run in place.runs_of(engraved.specimen)]
+        corners = engraved.corners_px.round(2).tolist()
+        rows.append(
+            {"id": engraved.specimen, "kind": engraved.kind, "known": known, "runs": runs, "corners_px": corners}
+        )
+    lines = [f"{r['id']}  {len(r['runs'])} runs{'' if r['known'] else ' (no such specimen here)'}" for r in rows]
+    show({"specimens": rows}, as_json, lines)

@@ -1,0 +1,1 @@
+"""Pictures to millimetres: markers, lens, bed alignment, kerf, inspection, engraved ids."""

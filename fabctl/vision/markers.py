@@ -1,0 +1,241 @@
+"""Find coded square markers in a picture: OpenCV proposes quadrilaterals, the marker's own picture decides.
+
+A find is accepted only where the whole blurred picture of one marker correlates with the pixels, and clearly better
+than that of any other marker. That reads markers whose modules are as small as the blur, and leaves textures alone.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fabctl.vision.template import (
+    CORNERS,
+    F64,
+    Fit,
+    correlation,
+    fit,
+    homography,
+    look,
+    module_px,
+    render,
+    sample_grid,
+    warp,
+)
+
+Family = Literal["5x5_250", "mip_36h12"]
+FAMILIES: dict[Family, str] = {"5x5_250": "DICT_5X5_250", "mip_36h12": "DICT_ARUCO_MIP_36h12"}
+ACCEPT_RATIO = 0.80  # correlation of the whole picture, frame and margin included
+MARGIN_RATIO = 0.06  # by how much the best code must beat the second
+CODE_RATIO = 0.55  # correlation of the code's modules alone, where frame and margin no longer help
+SCREEN_RATIO = 0.45  # correlation with the bare frame that a quadrilateral needs to be looked at further
+BLURS_px = (0.5, 0.9, 1.4, 2.0, 3.0)
+COARSE_PER_MODULE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """One marker in a picture. `H` maps its own frame (-1 to 1, y down) to pixels."""
+
+    family: Family
+    id: int
+    H: F64  # (3, 3)
+    score_ratio: float
+    contrast_frac: float
+    blur_px: float
+    module_px: float  # the shorter side of a module
+
+    @property
+    def centre_px(self) -> F64:
+        """Return the picture of the marker's centre (2,), perspective included."""
+        return np.asarray(self.H[:2, 2] / self.H[2, 2], dtype=np.float64)
+
+    @property
+    def corners_px(self) -> F64:
+        """Return the corners (4, 2): upper left, upper right, lower right, lower left in the marker's own frame."""
+        return warp(self.H, CORNERS)
+
+
+@functools.cache
+def codes(family: Family) -> F64:
+    """Return the modules (ids, m, m) of every marker of the family, frame included; 1 is white."""
+    import cv2
+
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[family]))
+    inner = int(dictionary.markerSize)
+    found = np.zeros((len(dictionary.bytesList), inner + 2, inner + 2))
+    for k, row in enumerate(dictionary.bytesList):
+        found[k, 1:-1, 1:-1] = cv2.aruco.Dictionary.getBitsFromByteList(row[None], inner)
+    return found
+
+
+def find_markers(
+    image: NDArray[np.uint8],
+    family: Family = "5x5_250",
+    *,
+    upscale: int = 1,
+    inverted: bool = False,
+    smallest_px: float = 20.0,
+) -> list[Marker]:
+    """Return the markers in a grey picture (h, w), each id once, by id.
+
+    `upscale` enlarges the picture for the search alone, for markers of few pixels; `inverted` also takes light markers
+    on dark ground; `smallest_px` is the least side of a marker.
+    """
+    grey = np.ascontiguousarray(image, dtype=np.float64)
+    found: dict[int, Marker] = {}
+    for quad in _quadrilaterals(image, family, upscale, inverted, smallest_px):
+        marker = read_quadrilateral(grey, quad, family, inverted)
+        if marker and (marker.id not in found or found[marker.id].score_ratio < marker.score_ratio):
+            found[marker.id] = marker
+    return [found[k] for k in sorted(found)]
+
+
+def mirrored(image: NDArray[np.uint8], family: Family = "5x5_250") -> list[Marker]:
+    """Return the markers that the picture shows only in a mirror: what a sheet upside down would give."""
+    return find_markers(np.ascontiguousarray(image[:, ::-1]), family)
+
+
+def read_quadrilateral(grey: F64, quad: F64, family: Family, inverted: bool = False) -> Marker | None:
+    """Return the marker of which `quad` (4, 2), clockwise on the screen, is about the outline; None where none is."""
+    modules = codes(family).shape[1]
+    H = homography(CORNERS, quad)
+    size_px = math.sqrt(math.prod(module_px(H, modules)))
+    places = sample_grid(modules, COARSE_PER_MODULE)
+    grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    seen = look(grey, warp(H, grid))
+    frame = abs(correlation(seen[_frame_mask(modules)], _frame(modules)))
+    if not frame >= SCREEN_RATIO:
+        return None
+    seen = seen - seen.mean()
+    seen /= max(float(np.linalg.norm(seen)), 1e-9)
+    best: tuple[float, int, float] | None = None
+    for blur_px in BLURS_px:
+        scores = _templates(family, _level(blur_px / size_px)) @ seen
+        k = int(np.argmax(np.abs(scores) if inverted else scores))
+        if best is None or abs(scores[k]) > best[0]:
+            best = (abs(float(scores[k])), k, blur_px)
+    if best is None or best[0] < CODE_RATIO:
+        return None
+    return _refined(grey, H, family, best[1], best[2], inverted)
+
+
+def _refined(grey: F64, H: F64, family: Family, k: int, blur_px: float, inverted: bool) -> Marker | None:
+    """Fit code `k` (id and quarter turns), then let it stand against all others."""
+    number, turns = divmod(k, 4)
+    turned = H @ _quarter_turns(turns)
+    bits = codes(family)[number]
+    found = _best_blur(grey, bits, turned / turned[2, 2], blur_px)
+    if found is None or found.score_ratio < (-1 if inverted else ACCEPT_RATIO) or abs(found.score_ratio) < ACCEPT_RATIO:
+        return None
+    if not _stands_out(grey, found, family, number):
+        return None
+    px = module_px(found.H, len(bits))
+    return Marker(family, number, found.H, abs(found.score_ratio), found.contrast_frac, found.blur_px, min(px))
+
+
+def _best_blur(grey: F64, bits: F64, H: F64, blur_px: float) -> Fit | None:
+    best = fit(grey, bits, H, blur_px)
+    if best is None:
+        return None
+    for direction in (0.7, 1.4):
+        trial = blur_px
+        while True:
+            trial *= direction
+            other = fit(grey, bits, best.H, trial, steps=4)
+            if other is None or other.score_ratio <= best.score_ratio + 1e-4 or not 0.1 < trial < 20:
+                break
+            best = other
+    return fit(grey, bits, best.H, best.blur_px)
+
+
+def _stands_out(grey: F64, found: Fit, family: Family, number: int) -> bool:
+    """Say whether the code's own modules fit, and no other id fits nearly as well."""
+    modules = codes(family).shape[1]
+    places = sample_grid(modules, COARSE_PER_MODULE)
+    grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    seen = look(grey, warp(found.H, grid))
+    level = _level(found.blur_px / math.sqrt(math.prod(module_px(found.H, modules))))
+    inner = np.abs(grid).max(axis=1) < 1 - 2 / modules
+    scores = np.abs(_inner_templates(family, level) @ _unit(seen[inner]))
+    own = float(scores.reshape(-1, 4)[number].max())
+    others = np.delete(scores.reshape(-1, 4), number, axis=0).max()
+    return own >= CODE_RATIO and own >= float(others) + MARGIN_RATIO
+
+
+def _unit(values: F64) -> F64:
+    values = values - values.mean()
+    return np.asarray(values / max(float(np.linalg.norm(values)), 1e-9), dtype=np.float64)
+
+
+def _level(sigma_modules: float) -> float:
+    """Return the blur rounded to a coarse step, so that few template sets are ever made."""
+    return float(np.clip(round(sigma_modules * 5) / 5, 0.2, 1.0))
+
+
+@functools.cache
+def _pictures(family: Family, sigma_modules: float) -> F64:
+    """Return (ids * 4, s * s): every marker of the family in its four turns, not normalised."""
+    bits = codes(family)
+    places = sample_grid(bits.shape[1], COARSE_PER_MODULE)
+    turned = [render(np.rot90(code, k), places, (sigma_modules, sigma_modules)) for code in bits for k in range(4)]
+    return np.array(turned).reshape(len(turned), -1)
+
+
+@functools.cache
+def _templates(family: Family, sigma_modules: float) -> F64:
+    return np.apply_along_axis(_unit, 1, _pictures(family, sigma_modules))
+
+
+@functools.cache
+def _inner_templates(family: Family, sigma_modules: float) -> F64:
+    modules = codes(family).shape[1]
+    places = sample_grid(modules, COARSE_PER_MODULE)
+    inner = np.abs(np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)).max(axis=1) < 1 - 2 / modules
+    return np.apply_along_axis(_unit, 1, _pictures(family, sigma_modules)[:, inner])
+
+
+@functools.cache
+def _frame_mask(modules: int) -> NDArray[np.bool_]:
+    places = sample_grid(modules, COARSE_PER_MODULE)
+    outer = np.abs(np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)).max(axis=1)
+    return np.asarray(outer > 1 - 2 / modules)
+
+
+@functools.cache
+def _frame(modules: int) -> F64:
+    places = sample_grid(modules, COARSE_PER_MODULE)
+    outer = np.abs(np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)).max(axis=1)
+    return np.asarray(outer[_frame_mask(modules)] > 1, dtype=np.float64)
+
+
+def _quarter_turns(count: int) -> F64:
+    """Return the turn that undoes `np.rot90(code, count)` in the marker's frame (y down)."""
+    c, s = [(1, 0), (0, 1), (-1, 0), (0, -1)][count % 4]
+    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+
+
+def _quadrilaterals(
+    image: NDArray[np.uint8], family: Family, upscale: int, inverted: bool, smallest_px: float
+) -> list[F64]:
+    """Return what OpenCV takes for outlines of markers, accepted or not, in pixels of the picture itself."""
+    import cv2
+
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters.minMarkerPerimeterRate = 4 * smallest_px / max(image.shape)
+    parameters.polygonalApproxAccuracyRate = 0.06
+    parameters.adaptiveThreshWinSizeMax = 53
+    parameters.adaptiveThreshConstant = 5
+    parameters.minMarkerDistanceRate = 0.05
+    parameters.detectInvertedMarker = inverted
+    big = image if upscale == 1 else cv2.resize(image, None, fx=upscale, fy=upscale, interpolation=cv2.INTER_CUBIC)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[family]))
+    accepted, _, rejected = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(np.ascontiguousarray(big))
+    quads = [np.asarray(quad, dtype=np.float64).reshape(4, 2) for quad in (*accepted, *rejected)]
+    return [(quad + 0.5) / upscale - 0.5 for quad in quads]

@@ -1,0 +1,92 @@
+"""Pictures for a person: the job drawn onto the bed, the error map of an alignment, what an inspection found."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.pattern.paths import CutPath
+from fabctl.vision.align import Alignment
+from fabctl.vision.register import apply
+from fabctl.vision.template import F64
+
+Picture = NDArray[np.uint8]
+Colour = tuple[int, int, int]  # blue, green, red
+COLOURS: dict[str, Colour] = {
+    "engrave": (40, 160, 255),
+    "mark": (200, 120, 0),
+    "hole": (220, 60, 220),
+    "slit": (30, 30, 230),
+    "outline": (40, 180, 40),
+}
+SHIFT = 4  # OpenCV draws in sixteenths of a pixel
+MAGNIFIED = 100  # error arrows are drawn this much longer
+
+
+def polyline(picture: Picture, points_px: F64, colour: Colour, closed: bool = False, width_px: int = 1) -> None:
+    """Draw a polyline (n, 2), in pixels, onto a colour picture."""
+    import cv2
+
+    points = np.rint(points_px * (1 << SHIFT)).astype(np.int32).reshape(-1, 1, 2)
+    cv2.polylines(picture, [points], closed, colour, width_px, cv2.LINE_AA, SHIFT)
+
+
+def dense(points_mm: F64, closed: bool, step_mm: float = 2.0) -> F64:
+    """Return the polyline with points at most `step_mm` apart, since a lens bends straight lines."""
+    ring = np.vstack([points_mm, points_mm[:1]]) if closed else points_mm
+    parts = []
+    for a, b in itertools.pairwise(ring):
+        count = max(1, int(np.ceil(np.linalg.norm(b - a) / step_mm)))
+        parts.append(a + (b - a) * (np.arange(count) / count)[:, None])
+    return np.vstack([*parts, ring[-1:]])
+
+
+def job_on_bed(
+    image: Picture, paths: Sequence[CutPath], affine: F64, alignment: Alignment, height_mm: float
+) -> Picture:
+    """Return the bed picture in colour with the job drawn where it will be cut."""
+    import cv2
+
+    picture: Picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    for path in paths:
+        points = apply(affine, dense(path.points_mm, path.closed))
+        polyline(picture, alignment.to_pixels(points, height_mm), COLOURS[path.layer])
+    return picture
+
+
+def error_map(image: Picture, alignment: Alignment) -> Picture:
+    """Return the bed picture with a 20 mm grid of the machine, and each mark's error drawn MAGNIFIED times."""
+    import cv2
+
+    picture: Picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    places = np.array([(w.x_mm, w.y_mm) for w in alignment.witnesses])
+    low, high = np.floor(places.min(axis=0) / 20) * 20, np.ceil(places.max(axis=0) / 20) * 20
+    for k in (0, 1):
+        for value in np.arange(low[k], high[k] + 1, 20):
+            ends = np.array([[value, low[1]], [value, high[1]]] if k == 0 else [[low[0], value], [high[0], value]])
+            polyline(picture, alignment.to_pixels(dense(ends, False)), (120, 180, 60))
+    told = alignment.to_pixels(places)
+    for witness, at in zip(alignment.witnesses, told, strict=True):
+        seen = np.array([witness.u_px, witness.v_px])
+        tip = at + (seen - at) * MAGNIFIED
+        cv2.arrowedLine(picture, _whole(at), _whole(tip), (30, 30, 230), 2, cv2.LINE_AA)
+        label = f"{witness.id}: {witness.error_mm * 1000:.0f} um"
+        cv2.putText(picture, label, (int(at[0]) + 30, int(at[1])), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (20, 20, 200), 2)
+    text = f"{alignment.marks}: rms {alignment.rms_mm:.3f} mm, worst {alignment.worst_mm:.3f} mm; arrows x{MAGNIFIED}"
+    cv2.putText(picture, text, (20, 40), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (20, 20, 200), 2)
+    return picture
+
+
+def _whole(point: F64) -> tuple[int, int]:
+    return round(float(point[0])), round(float(point[1]))
+
+
+def write_picture(path: str, picture: Picture) -> None:
+    """Write a picture; raise `OSError` where it cannot be written."""
+    import cv2
+
+    if not cv2.imwrite(path, picture):
+        raise OSError(f"{path}: the picture cannot be written")

@@ -1,0 +1,176 @@
+"""How a square marker looks through a blurring lens, and the exact place where a picture shows it.
+
+A marker is a grid of black and white modules with a black frame and a white margin. Blurred by a Gaussian its grey
+value has a closed form: each axis alone is a difference of two normal distributions, so the picture of every marker is
+two small matrices around the module grid. Fitting that picture to the pixels by Gauss-Newton uses every edge of the
+marker, where a corner detector uses four points.
+
+Frames: a marker's own frame has x to the right and y down, the black square spans -1 to 1 in both. Pixel centres lie at
+whole numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.special import ndtr
+
+F64 = NDArray[np.float64]
+MARGIN_MODULES = 1.0  # how much of the white margin takes part
+PIXEL_SIGMA_PX = 0.29  # a square pixel blurs like a Gaussian of 1/sqrt(12)
+HUBER = 1.5  # residuals beyond this many standard deviations (dust, glare) count less
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A marker's place: `H` maps its own frame (-1 to 1) to pixels; `score_ratio` is the correlation, 1 at best."""
+
+    H: F64  # (3, 3)
+    score_ratio: float
+    contrast_frac: float  # white minus black over white, negative where white and black are exchanged
+    blur_px: float
+
+
+def warp(H: F64, points: F64) -> F64:
+    """Return `points` (n, 2) mapped by the homography `H`."""
+    mapped = np.column_stack([points, np.ones(len(points))]) @ H.T
+    return np.asarray(mapped[:, :2] / mapped[:, 2:], dtype=np.float64)
+
+
+def homography(source: F64, target: F64) -> F64:
+    """Return the homography that maps four or more points (n, 2) to `target` with the least algebraic residual.
+
+    Both sides are centred and scaled first (Hartley 1997), which the solution's accuracy needs.
+    """
+    Ns, Nt = _normaliser(source), _normaliser(target)
+    s, t = warp(Ns, source), warp(Nt, target)
+    one, zero = np.ones(len(s)), np.zeros((len(s), 3))
+    h = np.column_stack([s, one])
+    rows = np.vstack([np.hstack([h, zero, -t[:, :1] * h]), np.hstack([zero, h, -t[:, 1:] * h])])
+    H = np.linalg.inv(Nt) @ np.linalg.svd(rows)[2][-1].reshape(3, 3) @ Ns
+    return np.asarray(H / H[2, 2], dtype=np.float64)
+
+
+def _normaliser(points: F64) -> F64:
+    centre = points.mean(axis=0)
+    scale = math.sqrt(2) / max(float(np.linalg.norm(points - centre, axis=1).mean()), 1e-12)
+    return np.array([[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1]])
+
+
+def sample_grid(modules: int, per_module: int) -> F64:
+    """Return sample places (s,) along one axis in the marker's frame, margin included, `per_module` to a module."""
+    half = 1 + 2 * MARGIN_MODULES / modules
+    count = round((modules + 2 * MARGIN_MODULES) * per_module)
+    return (np.arange(count) + 0.5) / count * 2 * half - half
+
+
+def blur_matrix(places: F64, modules: int, sigma_modules: float) -> F64:
+    """Return (s, modules) weights: how much of each module a blurred look at each place sees; the rest is white."""
+    x = (places + 1) / 2 * modules
+    edges = ndtr((x[:, None] - np.arange(modules + 1)) / max(sigma_modules, 1e-3))
+    return np.asarray(edges[:, :-1] - edges[:, 1:], dtype=np.float64)
+
+
+def render(bits: F64, places: F64, sigma_modules: tuple[float, float]) -> F64:
+    """Return grey values (s, s) of a marker with the modules `bits` (1 white), blurred by sigma along x and along y."""
+    ink = 1 - bits
+    across, down = (blur_matrix(places, len(bits), sigma) for sigma in sigma_modules)
+    return np.asarray(1 - down @ ink @ across.T, dtype=np.float64)
+
+
+def module_px(H: F64, modules: int) -> tuple[float, float]:
+    """Return how many pixels a module in the marker's middle is wide along its x and its y."""
+    step = 1.0 / modules
+    c, x, y = warp(H, np.array([[0.0, 0.0], [2 * step, 0.0], [0.0, 2 * step]]))
+    return float(np.linalg.norm(x - c)), float(np.linalg.norm(y - c))
+
+
+def look(image: F64, points_px: F64) -> F64:
+    """Return grey values at `points_px` (n, 2), linear between pixels; the border repeats."""
+    return np.asarray(map_coordinates(image, points_px[:, ::-1].T, order=1, mode="nearest"), dtype=np.float64)
+
+
+def fit(image: F64, bits: F64, H: F64, blur_px: float, steps: int = 12) -> Fit | None:
+    """Move `H` until the blurred marker matches the picture best; None where it runs away or the picture is flat.
+
+    Unknown besides the eight of the homography: black, white, and a linear change of light over the marker.
+    """
+    modules = len(bits)
+    px = module_px(H, modules)
+    if not min(px) > 0.5:
+        return None
+    per_module = int(np.clip(math.ceil(max(px)), 3, 8))
+    places = sample_grid(modules, per_module)
+    grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    sigma_px = math.hypot(blur_px, PIXEL_SIGMA_PX)
+    model = render(bits, places, (sigma_px / px[0], sigma_px / px[1])).ravel()
+    fixed = np.column_stack([np.ones(len(grid)), model, grid])
+    origin, patch, slope_x, slope_y = _patch(image, H, modules)
+    if patch.size == 0:
+        return None
+    moved_px = 0.0
+    for _ in range(steps):
+        at = warp(H, grid) - origin
+        grey = look(patch, at)
+        J = np.column_stack([_steering(H, grid, look(slope_x, at), look(slope_y, at)), -fixed])
+        plain = grey - fixed @ np.linalg.lstsq(fixed, grey, rcond=None)[0]
+        spread = max(1.4826 * float(np.median(np.abs(plain))), 1e-6)
+        weight = np.sqrt(np.minimum(1.0, HUBER * spread / np.maximum(np.abs(plain), 1e-9)))
+        step = np.linalg.lstsq(J * weight[:, None], -grey * weight, rcond=None)[0]
+        before = warp(H, CORNERS)
+        H = H + np.append(step[:8], 0.0).reshape(3, 3)
+        change = float(np.abs(warp(H, CORNERS) - before).max())
+        moved_px += change
+        if not np.isfinite(change) or moved_px > 2.5 * max(px):
+            return None
+        if change < 2e-3:
+            break
+    return _judge(H, patch, origin, grid, model, fixed, blur_px)
+
+
+CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def _patch(image: F64, H: F64, modules: int) -> tuple[F64, F64, F64, F64]:
+    reach = warp(H, CORNERS * (1 + 6 / modules))
+    low = np.maximum(np.floor(reach.min(axis=0)).astype(int) - 2, 0)
+    high = np.minimum(np.ceil(reach.max(axis=0)).astype(int) + 3, np.array(image.shape[::-1]))
+    if np.any(high - low < 4):
+        return np.zeros(2), np.empty((0, 0)), np.empty((0, 0)), np.empty((0, 0))
+    patch = image[low[1] : high[1], low[0] : high[0]].astype(np.float64)
+    slopes = np.gradient(patch)
+    return low.astype(np.float64), patch, np.asarray(slopes[1]), np.asarray(slopes[0])
+
+
+def _steering(H: F64, grid: F64, slope_x: F64, slope_y: F64) -> F64:
+    """Return (n, 8): how each grey value changes with the first eight entries of `H`."""
+    w = np.column_stack([grid, np.ones(len(grid))])
+    mapped = w @ H.T
+    scale = 1 / mapped[:, 2]
+    x, y = mapped[:, 0] * scale, mapped[:, 1] * scale
+    along = slope_x * x + slope_y * y
+    return np.column_stack(
+        [w * (slope_x * scale)[:, None], w * (slope_y * scale)[:, None], -grid * (along * scale)[:, None]]
+    )
+
+
+def _judge(H: F64, patch: F64, origin: F64, grid: F64, model: F64, fixed: F64, blur_px: float) -> Fit | None:
+    grey = look(patch, warp(H, grid) - origin)
+    levels = np.linalg.lstsq(fixed, grey, rcond=None)[0]
+    light = fixed[:, [0, 2, 3]] @ levels[[0, 2, 3]]
+    score = correlation(grey - (light - levels[0]), model)
+    white = float(levels[0] + levels[1])
+    if not np.isfinite(score) or white <= 0:
+        return None
+    return Fit(H / H[2, 2], score, float(levels[1]) / max(white, float(levels[0])), blur_px)
+
+
+def correlation(a: F64, b: F64) -> float:
+    """Return Pearson's correlation of two arrays; NaN where one is flat."""
+    a, b = a - a.mean(), b - b.mean()
+    size = math.sqrt(float((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum() / size) if size > 0 else math.nan

@@ -1,0 +1,96 @@
+"""Boards are drawn as OpenCV knows them, true to size, and their files say what the print measures."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from pathlib import Path
+
+import cv2
+import ezdxf
+import numpy as np
+import pytest
+from shapely import LineString, Polygon, unary_union
+
+from fabctl.config.boards import config_of, load_board, write_board
+from fabctl.errors import ConfigError
+from fabctl.vision import boards
+from fabctl.vision.drawing import POINTS_PER_MM, drawing_of, dxf, pdf
+
+BOARD = boards.Charuco("lens", 10, 7, 20.0, 15.0)
+
+
+def test_our_board_is_the_one_opencv_looks_for() -> None:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
+    told = cv2.aruco.CharucoBoard((10, 7), 20.0, 15.0, dictionary, BOARD.ids).generateImage((1400, 980), marginSize=0)
+    black = unary_union([Polygon(r) for r in boards.charuco_ink(BOARD)])
+    assert black.area / (200 * 140) == pytest.approx(float(np.mean(told == 0)), abs=5e-3)
+    rng = np.random.default_rng(1)
+    places = rng.uniform([0, 0], [200, 140], (400, 2))
+    drawn = np.array([black.contains(LineString([p, p + 1e-9]).centroid) for p in places])
+    seen = told[(980 - places[:, 1] * 7).astype(int), (places[:, 0] * 7).astype(int)] == 0
+    assert np.mean(drawn != seen) < 0.02
+
+
+def test_a_mark_that_is_turned_keeps_its_centre_and_its_first_corner() -> None:
+    mark = boards.Mark(1, 10.0, 20.0, 8.0, math.pi / 2)
+    assert mark.corners_mm.mean(axis=0) == pytest.approx([10, 20])
+    assert mark.corners_mm[0] == pytest.approx([6, 16])  # upper left of the mark, turned a quarter to the left
+
+
+def test_hatching_burns_the_black_and_nothing_else() -> None:
+    ink = boards.mark_ink(boards.Mark(3, 5.0, 5.0, 7.0), "5x5_250")
+    strokes = boards.hatch(ink, 0.1, 0.1)
+    burned = unary_union([LineString(s.points_mm).buffer(0.05) for s in strokes])
+    black = unary_union([Polygon(r) for r in ink])
+    assert burned.difference(black.buffer(0.03)).area < 1e-6
+    assert black.difference(burned).area / black.area < 0.02
+
+
+def test_the_pdf_is_true_to_size() -> None:
+    text = pdf(drawing_of(BOARD)).decode("latin-1")
+    (scale,) = re.findall(r"([\d.]+) 0 0 [\d.]+ [\d.]+ [\d.]+ cm", text)
+    assert float(scale) == pytest.approx(72 / 25.4)
+    numbers = np.array([[float(a), float(b)] for a, b in re.findall(r"(-?[\d.]+) (-?[\d.]+) [ml]\b", text)])
+    assert numbers.max(axis=0) == pytest.approx([200, 140])
+    (box,) = re.findall(r"MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", text)
+    assert float(box[0]) == pytest.approx(224 * POINTS_PER_MM, abs=1e-3)
+    table = int(re.findall(r"startxref\n(\d+)", text)[0])
+    assert text[table : table + 4] == "xref"
+
+
+def test_the_dxf_holds_outlines_and_strokes_in_millimetres() -> None:
+    sheet = boards.registration_marks((150.0, 100.0))
+    strokes = boards.hatch(boards.sheet_ink(sheet), 0.2, 0.1)
+    document = ezdxf.read(io.StringIO(dxf(drawing_of(sheet), strokes)))
+    layers = [entity.dxf.layer for entity in document.modelspace()]
+    assert layers.count("engrave") == len(strokes)
+    assert layers.count("engrave-fill") >= 6
+    assert document.units == 4
+
+
+def test_a_board_file_is_read_as_written_and_the_measured_size_counts(tmp_path: Path) -> None:
+    for board in (BOARD, boards.bed_marks((300.0, 200.0))):
+        write_board(config_of(board), tmp_path / "b.yaml")
+        config = load_board(str(tmp_path / "b.yaml"), tmp_path)
+        assert (config.charuco() if config.kind == "charuco" else config.mark_sheet()) == board
+    (tmp_path / "b.yaml").write_text((tmp_path / "b.yaml").read_text() + "measured_mm: [297.0, 199.0]\n")
+    sheet = load_board(str(tmp_path / "b.yaml"), tmp_path).mark_sheet()
+    assert sheet.marks[3].x_mm == pytest.approx(288 * 0.99)
+    assert sheet.marks[11].y_mm == pytest.approx(188 * 0.995)
+
+
+@pytest.mark.parametrize(
+    ("more", "complaint"),
+    [
+        ("measured_mm: [200.0, 200.0]\nmarks: [{id: 1, x_mm: 0, y_mm: 0, side_mm: 1}]", "10 %"),
+        ("kind: charuco", "given twice"),
+        ("marks: [{id: 1, x_mm: 0, y_mm: 0, side_mm: 1}, {id: 1, x_mm: 9, y_mm: 0, side_mm: 1}]", "same id"),
+        ("mesured_mm: [1.0, 1.0]", "mesured_mm"),
+    ],
+)
+def test_a_wrong_board_file_is_refused(tmp_path: Path, more: str, complaint: str) -> None:
+    (tmp_path / "b.yaml").write_text(f"name: b\nkind: marks\nsize_mm: [300.0, 200.0]\n{more}\n")
+    with pytest.raises(ConfigError, match=complaint):
+        load_board(str(tmp_path / "b.yaml"), tmp_path)
