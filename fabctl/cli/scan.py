@@ -1,0 +1,216 @@
+"""`fabctl scan`: lay a cloud on its target and say how far it is off."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fabctl.cli.common import bench_option, json_option, lab, progress, say, show
+from fabctl.errors import FabctlError, RefusedError, Stopped, UsageError
+
+if TYPE_CHECKING:
+    from fabctl.scan.job import Request
+    from fabctl.workspace import Specimen, Workspace
+
+FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.group()
+def command() -> None:
+    """Align a scan with its target and report the deviation."""
+
+
+@command.command("run")
+@click.argument("words", nargs=-1, metavar="[SPECIMEN] [CLOUD]")
+@click.option("--target", type=FILE, help="Target mesh, for a cloud without a specimen.")
+@click.option(
+    "--scale",
+    type=click.Choice(["free", "known", "markers"]),
+    default="free",
+    show_default=True,
+    help="The cloud's scale: found from geometry, given by --unit-mm, or taken from a measured board.",
+)
+@click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
+@click.option("--markers", type=FILE, help="Markers as scanned: label,x,y,z in cloud units.")
+@click.option("--board", type=FILE, help="The board as measured: label,x,y,z in mm.")
+@click.option("--datum", type=FILE, help="Three or more points as scanned: label,x,y,z in cloud units.")
+@click.option("--datum-target", type=FILE, help="The same points on the target: label,x,y,z in mm.")
+@click.option("--tolerance-frac", type=click.FloatRange(min=0, min_open=True), help="Of the bounding-box diagonal.")
+@click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same answer.")
+@bench_option
+@json_option
+def run_scan(
+    words: tuple[str, ...],
+    target: Path | None,
+    scale: str,
+    unit_mm: float,
+    markers: Path | None,
+    board: Path | None,
+    datum: Path | None,
+    datum_target: Path | None,
+    tolerance_frac: float | None,
+    seed: int,
+    bench_name: str,
+    as_json: bool,
+) -> int:
+    """Compare CLOUD with the target of SPECIMEN, or with --target.
+
+    Without CLOUD the bench's scanner is asked for one. Exit code 3: no pose, or more than one; 6: out of tolerance.
+    """
+    from fabctl.scan.job import Request
+
+    here = lab()
+    specimen, cloud = _named(here, words, target)
+    mesh = target if specimen is None else specimen.design / "target.ply"
+    if mesh is None:
+        raise UsageError("name a specimen, or give --target")
+    predicted = None if specimen is None else specimen.design / "deployed.ply"
+    options: dict[str, Any] = {
+        "scale": scale,
+        "unit_mm": unit_mm,
+        "markers": markers,
+        "board": board,
+        "datum_cloud": datum,
+        "datum_target": datum_target,
+        "tolerance_frac": tolerance_frac,
+        "seed": seed,
+    }
+    if cloud is not None:
+        request = Request(cloud, mesh, predicted if predicted and predicted.is_file() else None, **options)
+        return _run(here, request, specimen, as_json)
+    if specimen is None:
+        raise UsageError("give the cloud's file")
+    fresh = _fetch(here, bench_name, specimen, seed)
+    return _run(here, Request(fresh, mesh, predicted, **options), specimen, as_json)
+
+
+def _named(here: Workspace, words: tuple[str, ...], target: Path | None) -> tuple[Specimen | None, Path | None]:
+    """Return the specimen and the cloud that the command line names."""
+    from fabctl.workspace import SPECIMEN
+
+    if len(words) > 2:
+        raise UsageError(f"too many words: {' '.join(words)}")
+    if target is not None:
+        if len(words) != 1:
+            raise UsageError("with --target give the cloud's file and nothing else")
+        return None, Path(words[0])
+    if not words:
+        raise UsageError("name a specimen, or give --target and a cloud")
+    if not SPECIMEN.fullmatch(words[0]) and Path(words[0]).is_file():
+        raise UsageError(f"{words[0]} is a file; give the specimen first, or --target")
+    return here.specimen(words[0]), Path(words[1]) if len(words) == 2 else None
+
+
+def _fetch(here: Workspace, bench_name: str, specimen: Specimen, seed: int) -> Path:
+    """Ask the bench's scanner for a cloud of the specimen; return its file."""
+    from fabctl.bench import open_bench
+    from fabctl.config.bench import load_bench
+
+    config = load_bench(bench_name, here.root)
+    if config.scan is None:
+        raise UsageError(f"bench {config.name} has no scan section; give the cloud's file")
+    with open_bench(here, config, f"scan of {specimen.name}") as bench:
+        if config.scan.inbox is not None:
+            return _newest(Path(config.scan.inbox.replace("{state}", str(bench.state))))
+        assert config.scan.command is not None
+        bench.lay(specimen.design)
+        out = bench.state / "scans" / f"{specimen.name}-{seed}.ply"
+        out.parent.mkdir(exist_ok=True)
+        out.unlink(missing_ok=True)
+        places = {
+            "slot": bench.slot or specimen.design,
+            "out": out,
+            "seed": seed,
+            "truth": bench.state / "truth",
+            "state": bench.state,
+        }
+        asked = [w.format(**places) for w in shlex.split(config.scan.command)]
+        asked[0] = sys.executable if asked[0] == "python" else asked[0]
+        say(f"scanning: {' '.join(asked[:4])} …")
+        done = subprocess.run(asked, capture_output=True, text=True, check=False)
+        if done.returncode or not out.is_file():
+            raise _ScannerFailed(f"the scanner made no cloud (exit {done.returncode}): {done.stderr.strip()[-500:]}")
+        return out
+
+
+class _ScannerFailed(FabctlError):
+    """The bench's scan command ended without a cloud."""
+
+    exit_code = 4
+
+
+def _newest(inbox: Path) -> Path:
+    from fabctl.scan.cloud import FORMATS
+
+    found = [p for p in inbox.iterdir() if p.suffix.lower() in FORMATS] if inbox.is_dir() else []
+    if not found:
+        raise UsageError(f"{inbox}: no cloud lies there")
+    return max(found, key=lambda p: p.stat().st_mtime)
+
+
+def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: bool) -> int:
+    """Compare, write the run record, show the result; return the exit code."""
+    from fabctl.records.folder import start_run
+    from fabctl.scan.job import compare, record
+
+    missing = [str(p) for p in request.files() if not p.is_file()]
+    if missing:
+        raise UsageError(f"no such file: {', '.join(missing)}")
+    name = None if specimen is None else specimen.name
+    config = {k: getattr(request, k) for k in ("scale", "unit_mm", "tolerance_frac")}
+    run = start_run(here.runs, "scan", specimen=name, inputs=request.files(), config=config, seed=request.seed)
+    log, live = run.log_events(), progress()
+
+    def emit(event: Any) -> None:
+        log(event)
+        live(event)
+
+    try:
+        made = compare(request, emit)
+        body = record(run, made)
+    except KeyboardInterrupt:
+        run.finish("stopped", "stopped by the operator")
+        raise Stopped("stopped") from None
+    except Exception as fault:
+        run.finish("refused" if isinstance(fault, RefusedError) else "failed", str(fault))
+        raise
+    run.finish("refused" if made.exit_code == 3 else "done", _sentence(body), verdict=body["verdict"])
+    show({"run": run.run_id, "folder": str(run.path), **body}, as_json, _lines(body, run.path))
+    return made.exit_code
+
+
+def _sentence(body: dict[str, Any]) -> str:
+    found = body.get("deviation")
+    if found is None:
+        return f"{body['status']}: " + "; ".join(f["message"] for f in body["findings"] if f["level"] == "error")
+    return (
+        f"{body['verdict']}: rms {found['rms_mm']:.3f} mm ({found['rms_frac']:.3%} of the diagonal), "
+        f"95 % of the area within {found['p95_abs_mm']:.3f} mm"
+    )
+
+
+def _lines(body: dict[str, Any], folder: Path) -> list[str]:
+    lines = [_sentence(body)]
+    found = body.get("deviation")
+    if found is not None:
+        place = ", ".join(f"{x:.1f}" for x in found["max_place_mm"])
+        lines += [
+            f"mean {found['mean_mm']:+.3f} mm, mean absolute {found['mean_abs_mm']:.3f} mm, "
+            f"largest {found['max_mm']:+.3f} mm at ({place})",
+            f"{found['coverage_frac']:.0%} of the target seen; {found['border_count']} points past its border and "
+            f"{found['lone_count']} wrong matches left out of {found['points_count']}",
+            f"scale {body['pose']['unit_mm']:.6g} mm a unit; pose decided by {body['decided_by']}",
+        ]
+    if body.get("against_predicted"):
+        model = body["against_predicted"]
+        lines.append(
+            f"against the predicted shape: rms {model['rms_mm']:.3f} mm; "
+            f"it knew {model['known_frac']:.0%} of the deviation"
+        )
+    lines += [f"{f['level']} {f['code']}: {f['message']}" for f in body["findings"]]
+    return [*lines, f"record: {folder}"]

@@ -1,0 +1,319 @@
+"""One comparison from files to numbers, and its run record."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.findings import Finding
+from fabctl.errors import DONE, OUT_OF_TOLERANCE, REFUSED, UsageError
+from fabctl.events import Emit, Event, silent
+from fabctl.records.folder import RunFolder
+from fabctl.scan.clean import Cleaned, clean
+from fabctl.scan.cloud import Cloud, read_cloud, read_labelled, write_csv, write_ply
+from fabctl.scan.deviation import Deviation, Statistics, Uncertainty, bootstrap, deviate, statistics
+from fabctl.scan.markers import Scale, scale_from_board
+from fabctl.scan.refine import Options, refine
+from fabctl.scan.register import FINAL_POINTS, Datums, Judged, Registration, register
+from fabctl.scan.symmetry import Symmetries, find_symmetries
+from fabctl.scan.target import Target
+
+Floats = NDArray[np.float64]
+ScaleChoice = Literal["free", "known", "markers"]
+Verdict = Literal["pass", "fail", "no tolerance given", "undecided"]
+
+SHARE_WITHIN_FRAC = 0.95  # of the compared area must lie within the tolerance
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What to compare, and how."""
+
+    cloud: Path
+    target: Path
+    predicted: Path | None = None
+    scale: ScaleChoice = "free"
+    unit_mm: float = 1.0  # for a known scale
+    markers: Path | None = None  # label,x,y,z in cloud units
+    board: Path | None = None  # label,x,y,z in mm
+    datum_cloud: Path | None = None  # label,x,y,z in cloud units
+    datum_target: Path | None = None  # label,x,y,z in mm, in the target's frame
+    tolerance_frac: float | None = None
+    seed: int = 0
+
+    def files(self) -> list[Path]:
+        """Return every file the comparison reads."""
+        named = (
+            self.cloud,
+            self.target,
+            self.predicted,
+            self.markers,
+            self.board,
+            self.datum_cloud,
+            self.datum_target,
+        )
+        return [path for path in named if path is not None]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Everything that came out; deviation and statistics are None where there is no pose."""
+
+    request: Request
+    target: Target
+    cloud: Cloud
+    cleaned: Cleaned
+    registration: Registration
+    scale: Scale | None
+    deviation: Deviation | None = None
+    statistics: Statistics | None = None
+    uncertainty: Uncertainty | None = None
+    alternative_rms_mm: tuple[float, ...] = ()
+    predicted: Predicted | None = None
+    verdict: Verdict = "undecided"
+    findings: tuple[Finding, ...] = field(default_factory=tuple)
+
+    @property
+    def exit_code(self) -> int:
+        """Return what the command line ends with."""
+        if self.verdict == "undecided":
+            return REFUSED
+        return OUT_OF_TOLERANCE if self.verdict == "fail" else DONE
+
+
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """The same scan against the shape the model foresaw: what it knew of the deviation and what it did not."""
+
+    statistics: Statistics
+    known_frac: float  # share of the mean square deviation from the target that the prediction explains
+
+
+def read_target(path: Path) -> Target:
+    """Return the target in the file; raises the errors of `design.meshfiles.read_mesh`."""
+    from design.meshfiles import read_mesh
+
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
+    return Target(read_mesh(path)[0], path.name)
+
+
+def compare(request: Request, emit: Emit = silent) -> Comparison:
+    """Return the comparison that is asked for; the same files, options and seed give the same numbers."""
+    target = read_target(request.target)
+    emit(Event("stage", f"reading {request.cloud}"))
+    cloud = read_cloud(request.cloud, request.seed)
+    scale = known_scale(request)
+    emit(Event("stage", f"cleaning {len(cloud.points)} points"))
+    cleaned = clean(cloud.points, request.seed)
+    emit(Event("stage", "looking for the target's own symmetries"))
+    symmetries = find_symmetries(target)
+    registration = register(
+        cloud.points,
+        cleaned,
+        target,
+        symmetries,
+        scale_ratio=None if scale is None else scale.unit_mm,
+        datums=read_datums(request),
+        seed=request.seed,
+        emit=emit,
+    )
+    made = Comparison(request, target, cloud, cleaned, registration, scale)
+    findings = [*cloud.findings, *registration.findings]
+    if registration.status not in ("aligned", "symmetric") or registration.best is None:
+        return replace(made, findings=tuple(findings))
+    emit(Event("stage", "measuring deviations"))
+    return _measured(made, symmetries, findings)
+
+
+def known_scale(request: Request) -> Scale | None:
+    """Return the scale that is known beforehand, or None where geometry must find it."""
+    if request.scale == "known":
+        return Scale(request.unit_mm, 0.0, 0)
+    if request.scale == "free":
+        return None
+    if request.markers is None or request.board is None:
+        raise UsageError("--scale markers needs --markers (from the scan) and --board (as measured, mm)")
+    return scale_from_board(read_labelled(request.markers), read_labelled(request.board))
+
+
+def read_datums(request: Request) -> Datums | None:
+    """Return the datum points that both files name, or None where none are given."""
+    if request.datum_cloud is None and request.datum_target is None:
+        return None
+    if request.datum_cloud is None or request.datum_target is None:
+        raise UsageError("datum points need both their places in the scan and on the target")
+    seen, meant = read_labelled(request.datum_cloud), read_labelled(request.datum_target)
+    labels = tuple(sorted(set(seen) & set(meant)))
+    if len(labels) < 3:
+        raise UsageError(f"three datum points or more must be named in both files; common are: {', '.join(labels)}")
+    return Datums(labels, np.array([seen[k] for k in labels]), np.array([meant[k] for k in labels]))
+
+
+def _measured(made: Comparison, symmetries: Symmetries, findings: list[Finding]) -> Comparison:
+    registration, target, request = made.registration, made.target, made.request
+    best = registration.best
+    assert best is not None
+    points = made.cloud.points[registration.specimen]
+    deviation = deviate(points, best.pose, target)
+    numbers = statistics(deviation, target)
+    spread = bootstrap(best.fit, target, request.seed, free_scale=made.scale is None, still=symmetries.still(target))
+    some = points[:: max(1, len(points) // 60_000)]
+    others = [statistics(deviate(some, a.pose, target), target) for a in registration.alternatives]
+    verdicts = {_verdict(s, request.tolerance_frac) for s in (numbers, *others)}
+    verdict: Verdict = _verdict(numbers, request.tolerance_frac)
+    if len(verdicts) > 1:
+        verdict = "undecided"
+        findings.append(
+            Finding(
+                "SCAN-VERDICT",
+                "symmetric poses lead to different verdicts, so there is none",
+                hint="give datum points (--datum)",
+            )
+        )
+    return replace(
+        made,
+        deviation=deviation,
+        statistics=numbers,
+        uncertainty=spread,
+        alternative_rms_mm=tuple(s.rms_mm for s in others),
+        predicted=_against_predicted(made, best, points, numbers),
+        verdict=verdict,
+        findings=tuple(findings),
+    )
+
+
+def _verdict(numbers: Statistics, tolerance_frac: float | None) -> Verdict:
+    if tolerance_frac is None:
+        return "no tolerance given"
+    return "pass" if numbers.within(tolerance_frac) >= SHARE_WITHIN_FRAC else "fail"
+
+
+def _against_predicted(made: Comparison, best: Judged, points: Floats, numbers: Statistics) -> Predicted | None:
+    """Return the comparison with the predicted shape, aligned to it from the pose on the target."""
+    if made.request.predicted is None:
+        return None
+    shape = read_target(made.request.predicted)
+    options = Options(free_scale=made.scale is None)
+    fit = refine(points[:: max(1, len(points) // FINAL_POINTS)], best.pose, shape, options)
+    found = statistics(deviate(points, fit.pose, shape), shape)
+    known = 1.0 - (found.rms_mm / numbers.rms_mm) ** 2 if numbers.rms_mm > 0 else 0.0
+    return Predicted(found, known)
+
+
+def result(made: Comparison) -> dict[str, Any]:
+    """Return the numbers as plain JSON, lengths with their unit in the key."""
+    registration, size = made.registration, made.target.diagonal_mm
+    body: dict[str, Any] = {
+        "verdict": made.verdict,
+        "status": registration.status,
+        "decided_by": registration.decided_by,
+        "tolerance_frac": made.request.tolerance_frac,
+        "share_within_required_frac": SHARE_WITHIN_FRAC,
+        "target": {"name": made.target.name, "diagonal_mm": size, "symmetries": registration.symmetries.describe()},
+        "cloud": cloud_facts(made),
+        "findings": [finding.as_dict() for finding in made.findings],
+    }
+    if registration.best is not None:
+        body["pose"] = _pose_facts(registration.best, made)
+        body["alternatives"] = [
+            {**_pose_facts(a, made), "ratio": a.score_frac / registration.best.score_frac, "deviation_rms_mm": rms}
+            for a, rms in zip(
+                registration.alternatives,
+                made.alternative_rms_mm or (None,) * len(registration.alternatives),
+                strict=True,
+            )
+        ]
+    if made.statistics is not None:
+        body["deviation"] = statistics_facts(made.statistics)
+    if made.uncertainty is not None:
+        body["uncertainty"] = {k: _finite(v) for k, v in asdict(made.uncertainty).items()}
+    if made.scale is not None:
+        body["scale"] = asdict(made.scale)
+    if made.predicted is not None:
+        body["against_predicted"] = {
+            **statistics_facts(made.predicted.statistics),
+            "known_frac": made.predicted.known_frac,
+        }
+    return body
+
+
+def cloud_facts(made: Comparison) -> dict[str, Any]:
+    """Return how many points the cloud has and what became of them."""
+    of = made.cleaned.cells.of_point
+    inside = of >= 0
+    sparse = np.zeros(len(of), dtype=bool)
+    sparse[inside] = made.cleaned.sparse[of[inside]]
+    specimen, table = made.registration.specimen, made.cleaned.is_table & ~made.registration.specimen
+    sparse &= ~specimen & ~table
+    return {
+        "points_count": len(of),
+        "specimen_count": int(specimen.sum()),
+        "table_count": int(table.sum()),
+        "stray_count": int(sparse.sum()),
+        "background_count": int((~specimen & ~table & ~sparse).sum()),
+        "part": None if made.registration.part is None else made.registration.part.name,
+        "has_table": made.cleaned.table is not None,
+        "cell_cu": made.cleaned.cells.size_cu,
+    }
+
+
+def _pose_facts(judged: Judged, made: Comparison) -> dict[str, Any]:
+    return {
+        "matrix": judged.pose.matrix(),
+        "unit_mm": judged.pose.scale_ratio,
+        "misfit_frac": judged.score_frac,
+        "cloud_rms_frac": judged.cloud_rms_frac,
+        "target_rms_frac": judged.target_rms_frac,
+        "coverage_frac": judged.coverage_frac,
+        "explained_frac": judged.explained_frac,
+        "relation": judged.relation,
+        "steps_count": judged.fit.steps_count,
+        "last_step_frac": _finite(judged.fit.last_step_frac),
+        "patch_sigma_frac": judged.fit.patch_sigma_frac,
+        "patches_left_out_frac": float((judged.fit.weight < 0.1).mean()) if len(judged.fit.weight) else 0.0,
+    }
+
+
+def statistics_facts(numbers: Statistics) -> dict[str, Any]:
+    """Return the statistics with every length also as a fraction of the diagonal."""
+    body: dict[str, Any] = {}
+    facts: Mapping[str, Any] = asdict(numbers)
+    for key, value in facts.items():
+        if key == "abs_quantiles_mm":
+            continue
+        body[key] = value
+        if key.endswith("_mm") and isinstance(value, float) and key != "diagonal_mm":
+            body[key.removesuffix("_mm") + "_frac"] = numbers.frac(value)
+    return body
+
+
+def _finite(value: Any) -> Any:
+    return value if not isinstance(value, float) or math.isfinite(value) else None
+
+
+def record(run: RunFolder, made: Comparison) -> dict[str, Any]:
+    """Write result, CSV and coloured PLY into the run folder; return the result."""
+    body = result(made)
+    if made.deviation is not None:
+        from fabctl.scan.colours import colours_of, span_mm
+
+        span = span_mm(made.deviation)
+        found = made.deviation
+        write_csv(run.artefact("deviation.csv"), found.points_mm, found.value_mm, found.area_weight, found.counts)
+        write_ply(run.artefact("deviation.ply"), found.points_mm, found.value_mm, colours_of(found.value_mm, span))
+        np.savez_compressed(
+            run.artefact("map.npz"),
+            vertices_mm=made.target.mesh.vertices_mm,
+            faces=made.target.mesh.faces,
+            deviation_mm=found.vertex_mm,
+        )
+        body["colour_span_mm"] = span
+    run.write_result(body)
+    return body

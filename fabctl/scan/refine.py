@@ -1,0 +1,275 @@
+"""The fine alignment: a real deviation must not drag the fit and hide itself.
+
+Residuals are averaged over patches of the target first. A patch of a hundred points is ten times less noisy than a
+point, so a weight that gives up a patch can be as narrow as a tenth of the noise: what truly deviates is left out
+almost whole, and not only what sticks out of the noise. Patches weigh by area, not by how many points they caught.
+Pairs on the border say nothing about the surface and are left out; where the border is, is its own set of equations,
+with one common offset (a cloud's edge is always a little inside the true one), so that a surface that can slide in
+itself (a cap) is held by its rim alone and the rest is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from fabctl.scan.foreign import nearest
+from fabctl.scan.similarity import Similarity, rotation_of
+from fabctl.scan.target import Target
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+PATCHES = 800
+LEAST_IN_PATCH = 6
+TUKEY = 4.685  # 95 % efficient for normal noise
+FLOOR_FRAC = 2e-5  # of the diagonal; below it a patch's residual is rounding, not shape
+RIM_REACH_FRAC = 0.05  # of the diagonal; how far from the border points may tell where the cloud's edge is
+RIM_REACH_FIRST_FRAC = 0.14  # likewise in the first step, while the surface may still have to slide
+RIM_QUANTILE = 0.96
+GROW_LIMIT_RATIO = 0.05
+
+Weighting = Literal["robust", "least-squares"]
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Linear equations `residual + jacobian @ x = 0` with an area weight; x = turn, shift, log scale.
+
+    Turn is in rad about the target's centroid; shift and residual are in diagonals.
+    """
+
+    jacobian: Floats  # (k, 7)
+    residual: Floats  # (k,)
+    area: Floats  # (k,), sums to 1 over the whole target
+    spread: Floats  # (k,), standard deviation expected from noise alone
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A refined pose and what it rests on."""
+
+    pose: Similarity  # cloud as read -> target, mm
+    patches: Rows
+    rim: Rows | None
+    weight: Floats  # of each patch, 0 to 1
+    rim_weight: Floats
+    patch_sigma_frac: float  # robust spread of patch residuals, of the diagonal
+    steps_count: int
+    last_step_frac: float  # motion of the last step, of the diagonal
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to refine: which unknowns are free and what is used."""
+
+    free_scale: bool = True
+    weighting: Weighting = "robust"
+    use_patches: bool = True
+    use_rim: bool = True
+    steps_count: int = 25
+    still_frac: float = 1e-5  # of the diagonal; a smaller step ends the work
+    band_frac: float = 0.05  # of the diagonal; farther points are not compared at first
+    free: tuple[bool, bool, bool, bool, bool, bool] = (True,) * 6  # turn and shift about/along the target's axes
+    still: Floats | None = None  # (7,), a motion that nothing can tell: the turn of a surface of revolution
+
+
+def refine(points: Floats, start: Similarity, target: Target, options: Options = Options()) -> Fit:
+    """Return the fit of the cloud's `points` (n, 3), as read, from the pose `start`, which must be near."""
+    pose, band, reach = start, options.band_frac, RIM_REACH_FIRST_FRAC
+    patch_tree = _patch_tree(target)
+    moved = np.inf
+    steps_count = 0
+    while steps_count < options.steps_count:
+        steps_count += 1
+        rows = patch_rows(points, pose, target, patch_tree, band) if options.use_patches else _no_rows()
+        rim = rim_rows(points, pose, target, reach) if options.use_rim else None
+        x, weight, rim_weight, sigma = solve(rows, rim, options)
+        moved = float(np.linalg.norm(x[:3]) * 0.5 + np.linalg.norm(x[3:6]) + 0.5 * abs(x[6]))
+        pose = moved_by(pose, x, target)
+        band, slid = max(0.6 * band, 0.02, 12 * sigma), reach == RIM_REACH_FRAC
+        reach = max(0.75 * reach, RIM_REACH_FRAC) if moved < 0.02 else reach
+        if moved < options.still_frac and slid:
+            break
+    rows = patch_rows(points, pose, target, patch_tree, band) if options.use_patches else _no_rows()
+    rim = rim_rows(points, pose, target, RIM_REACH_FRAC) if options.use_rim else None
+    _, weight, rim_weight, sigma = solve(rows, rim, options)
+    return Fit(pose, rows, rim, weight, rim_weight, sigma, steps_count, moved)
+
+
+def moved_by(pose: Similarity, x: Floats, target: Target) -> Similarity:
+    """Return `pose` followed by the small motion `x` (turn, shift, log scale) about the target's centroid."""
+    grow = float(np.exp(np.clip(x[6], -GROW_LIMIT_RATIO, GROW_LIMIT_RATIO)))
+    turn = rotation_of(x[:3])
+    centre = target.centre_mm
+    motion = Similarity(turn, centre - grow * turn @ centre + x[3:6] * target.diagonal_mm, grow)
+    return motion.after(pose)
+
+
+def _patch_tree(target: Target) -> cKDTree:
+    return cKDTree(target.even_samples(PATCHES)[0])
+
+
+def _no_rows() -> Rows:
+    return Rows(np.zeros((0, 7)), np.zeros(0), np.zeros(0), np.zeros(0))
+
+
+def jacobian(places: Floats, directions: Floats) -> Floats:
+    """Return how a residual along `directions` at `places` (about the centroid, in diagonals) changes with x."""
+    return np.concatenate(
+        [np.cross(places, directions), directions, np.sum(places * directions, axis=1)[:, None]], axis=1
+    )
+
+
+def patch_rows(points: Floats, pose: Similarity, target: Target, patches: cKDTree, band_frac: float) -> Rows:
+    """Return one equation for each patch of the target that enough points fall on.
+
+    Within a patch points far from its median by the noise's measure are given up (floaters, wrong matches).
+    """
+    placed = pose(points)
+    found = target.closest(placed)
+    size = target.diagonal_mm
+    gap = placed - found.points_mm
+    residual = np.sum(gap * found.normals, axis=1) / size
+    good = ~found.on_border & (np.abs(residual) < band_frac)
+    placed, normals, residual = placed[good], found.normals[good], residual[good]
+    _, patch = nearest(patches, found.points_mm[good])
+    middle = patch_medians(residual, patch, patches.n)
+    off = residual - middle[patch]
+    noise = max(1.4826 * float(np.median(np.abs(off))) if len(off) else 0.0, 1e-9)
+    weight = np.clip(1 - (off / (TUKEY * noise)) ** 2, 0, None) ** 2
+    total = np.bincount(patch, weight, minlength=patches.n)
+    count = np.bincount(patch, minlength=patches.n)
+    used = (count >= LEAST_IN_PATCH) & (total > 0.25 * count)
+    J = jacobian((placed - target.centre_mm) / size, normals)
+    mean = np.stack([np.bincount(patch, weight * J[:, k], minlength=patches.n) for k in range(7)], axis=1)
+    mean_residual = np.bincount(patch, weight * residual, minlength=patches.n)
+    share = np.full(patches.n, 1.0 / patches.n)
+    return Rows(
+        mean[used] / total[used, None],
+        mean_residual[used] / total[used],
+        share[used],
+        np.sqrt(noise**2 / total[used] + FLOOR_FRAC**2),
+    )
+
+
+def patch_medians(values: Floats, patch: Ints, count: int) -> Floats:
+    """Return the median of the values of each patch; NaN where there are none."""
+    order = np.lexsort((values, patch))
+    ends = np.searchsorted(patch[order], np.arange(count + 1))
+    held = ends[1:] > ends[:-1]
+    middle = np.full(count, np.nan)
+    middle[held] = values[order][((ends[:-1] + ends[1:] - 1) // 2)[held]]
+    return middle
+
+
+def rim_rows(points: Floats, pose: Similarity, target: Target, reach_frac: float = RIM_REACH_FRAC) -> Rows | None:
+    """Return one equation for each stretch of border near which the cloud has an edge, or None without a border.
+
+    The edge is a high quantile of how far out the points near that stretch lie; where the cloud ends well inside
+    there is none, and holes elsewhere do not matter.
+    """
+    border, size = target.border, target.diagonal_mm
+    if border is None:
+        return None
+    placed = pose(points)
+    distance, at = nearest(cKDTree(border.points_mm), placed, reach_frac * size)
+    near = np.isfinite(distance)
+    placed, at = placed[near], at[near]
+    gap = placed - border.points_mm[at]
+    level = np.abs(np.sum(gap * border.normals[at], axis=1)) < 0.4 * reach_frac * size
+    gap, at = gap[level], at[level]
+    # Stretches: neighbouring samples together, so that each holds enough points for a quantile.
+    stretch_of = _stretches(border.points_mm, max(8, min(120, len(gap) // 40)))
+    stretch = stretch_of[at]
+    out = np.sum(gap * border.outward[at], axis=1) / size
+    count = np.bincount(stretch, minlength=stretch_of.max() + 1)
+    order = np.lexsort((out, stretch))
+    ends = np.searchsorted(stretch[order], np.arange(len(count) + 1))
+    used = np.flatnonzero(count >= 25)
+    if len(used) < 6:
+        return None
+    edge = out[order][ends[used] + (RIM_QUANTILE * (count[used] - 1)).astype(int)]
+    places = np.stack([_mean_by(border.points_mm[:, k], stretch_of)[used] for k in range(3)], axis=1)
+    outward = np.stack([_mean_by(border.outward[:, k], stretch_of)[used] for k in range(3)], axis=1)
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
+    share = np.bincount(stretch_of)[used] / len(stretch_of)
+    J = jacobian((places - target.centre_mm) / size, outward)
+    return Rows(J, edge, share, np.full(len(used), reach_frac / 8))
+
+
+def _stretches(points: Floats, count: int) -> Ints:
+    """Return for each border sample the number of its stretch."""
+    from fabctl.scan.nearest import farthest_order
+
+    centres = points[farthest_order(points, count)]
+    return nearest(cKDTree(centres), points)[1]
+
+
+def _mean_by(values: Floats, group: Ints) -> Floats:
+    return np.asarray(np.bincount(group, values) / np.maximum(np.bincount(group), 1))
+
+
+def solve(rows: Rows, rim: Rows | None, options: Options) -> tuple[Floats, Floats, Floats, float]:
+    """Return the motion, the weights of patches and of rim stretches, and the patches' robust spread.
+
+    Weights begin with the median fit (1/|r|) and narrow to Tukey's about the spread found, which is re-estimated, so
+    that a broad misfit keeps all patches and a local one loses its own.
+    """
+    weight, rim_weight = np.ones(len(rows.residual)), np.ones(0 if rim is None else len(rim.residual))
+    sigma = rim_sigma = 0.0
+    x = np.zeros(8)
+    rounds = 1 if options.weighting == "least-squares" else 25
+    for k in range(rounds + 1):
+        x = _least_squares(rows, rim, weight, rim_weight, max(sigma, 1e-6), max(rim_sigma, 1e-4), options)
+        r = rows.residual + rows.jacobian @ x[:7]
+        sigma = _spread(r) if len(r) else 0.0
+        if rim is not None:
+            e = rim.residual + rim.jacobian @ x[:7] - x[7]
+            close = np.abs(e) < 3 * rim.spread[0]
+            rim_sigma = min(max(_spread(e[close]) if close.sum() > 5 else 1.0, 5e-4), float(rim.spread[0]))
+            # What sticks out over the border speaks against the pose; what is missing may just not have been seen.
+            rim_weight = np.where(e > 0, rim_sigma / np.maximum(e, rim_sigma), _tukey(e, 3.0 * rim_sigma))
+        if options.weighting == "least-squares" or k == rounds:
+            break
+        width = np.maximum(sigma, rows.spread)
+        narrow = TUKEY * width * (1.5 if k < 15 else 1.0)
+        weight = width / np.maximum(np.abs(r), width) if k < 10 else _tukey(r, narrow)
+    return x[:7], weight, rim_weight, sigma
+
+
+def _spread(residual: Floats) -> float:
+    return float(1.4826 * np.median(np.abs(residual - np.median(residual))))
+
+
+def _tukey(residual: Floats, width: Floats | float) -> Floats:
+    return np.asarray(np.clip(1 - (residual / width) ** 2, 0, None) ** 2)
+
+
+def _least_squares(
+    rows: Rows, rim: Rows | None, weight: Floats, rim_weight: Floats, sigma: float, rim_sigma: float, options: Options
+) -> Floats:
+    """Return the eight unknowns: motion, log scale, and the rim's common offset."""
+    w = weight * rows.area * max(len(rows.area), 1) / sigma**2
+    A, b = np.zeros((8, 8)), np.zeros(8)
+    A[:7, :7] = (rows.jacobian * w[:, None]).T @ rows.jacobian
+    b[:7] = -(rows.jacobian * w[:, None]).T @ rows.residual
+    if rim is not None:
+        J = np.concatenate([rim.jacobian, -np.ones((len(rim.residual), 1))], axis=1)
+        v = rim_weight / rim_sigma**2
+        A += (J * v[:, None]).T @ J
+        b -= (J * v[:, None]).T @ rim.residual
+    A[7, 7] += 1 / 0.01**2
+    fixed = [k for k in range(6) if not options.free[k]] + ([] if options.free_scale else [6])
+    A[fixed, :], A[:, fixed], b[fixed] = 0.0, 0.0, 0.0
+    A[fixed, fixed] = 1.0
+    if options.still is not None:
+        A[:7, :7] += 1e3 * np.trace(A[:7, :7]) * np.outer(options.still, options.still)
+    # What the data do not hold at all (a turn about the axis of a cap) stays where it is.
+    A[range(7), range(7)] += 1e-7 * np.trace(A[:7, :7]) + 1.0
+    return np.asarray(np.linalg.solve(A, b))

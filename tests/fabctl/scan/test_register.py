@@ -1,0 +1,58 @@
+"""The right pose or an honest no."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fabctl.scan.clean import clean
+from fabctl.scan.register import Datums, Registration, register
+from simulators.photogrammetry import ScanPlan
+from tests.fabctl.scan.conftest import TARGETS, scanned, symmetries_of, true_pose
+
+RAW = ScanPlan(seed=3, unseen_frac=0.3, points_count=20_000)
+
+
+def registered(name: str, plan: ScanPlan, datums: Datums | None = None) -> Registration:
+    made = scanned(name, plan)
+    cleaned = clean(made.points, plan.seed)
+    return register(made.points, cleaned, TARGETS[name], symmetries_of(name), datums=datums, seed=plan.seed)
+
+
+def error_frac(name: str, plan: ScanPlan, found: Registration) -> float:
+    assert found.best is not None
+    return symmetries_of(name).apart_frac(true_pose(scanned(name, plan)), found.best.pose, TARGETS[name])
+
+
+def test_a_raw_scan_of_unknown_scale_is_laid_right() -> None:
+    found = registered("freeform", RAW)
+    assert found.status == "aligned"
+    assert error_frac("freeform", RAW, found) < 0.0005
+    assert found.best is not None
+    assert found.best.pose.scale_ratio * scanned("freeform", RAW).scale_ratio == pytest.approx(1, abs=1e-3)
+
+
+def test_the_same_seed_gives_the_same_answer() -> None:
+    first, second = registered("freeform", RAW), registered("freeform", RAW)
+    assert first.best is not None
+    assert second.best is not None
+    assert np.array_equal(first.best.pose.rotation, second.best.pose.rotation)
+    assert first.best.pose.scale_ratio == second.best.pose.scale_ratio
+
+
+def test_a_cap_is_known_up_to_a_turn_about_its_axis() -> None:
+    assert symmetries_of("cap").continuous
+    assert abs(symmetries_of("cap").axis_direction @ np.array([0, 0, 1])) > 0.9999  # type: ignore[operator]
+
+
+def test_a_mirror_image_is_named() -> None:
+    plan = ScanPlan(seed=5, unseen_frac=0.1, points_count=20_000, mirrored=True)
+    found = registered("freeform", plan)
+    assert found.status == "mirrored"
+    assert [f.code for f in found.findings] == ["SCAN-MIRROR"]
+
+
+def test_an_unrelated_cloud_is_refused() -> None:
+    made = scanned("cap", RAW)
+    found = register(made.points, clean(made.points), TARGETS["freeform"], symmetries_of("freeform"), seed=0)
+    assert found.status == "failed"
