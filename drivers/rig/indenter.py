@@ -93,6 +93,11 @@ class Indenter:
         self._asked_s = -1.0
         self.lost_count = 0
 
+    @property
+    def next_number(self) -> int:
+        """Return the number that the next command will carry."""
+        return self._number + 1
+
     # --- reading
 
     def identify(self) -> Identity:

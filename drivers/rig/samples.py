@@ -81,6 +81,9 @@ class Freshness:
 
     def _advance(self, sequence: int, heartbeat: int, asked: Asked) -> int:
         if self._last is None:
+            # One reply alone could say anything; the first is believed when a second goes on from it.
+            if not self._goes_on(sequence, asked):
+                raise BadReply(f"status: sequence {sequence} is the first; a second must agree")
             return 0
         before, beat, last = self._last
         ticks = (sequence - before) % 2**32
@@ -102,12 +105,17 @@ class Freshness:
 
     def _doubt_a_restart(self, sequence: int, asked: Asked) -> None:
         """Raise `Restarted` where two replies in a row run on from an earlier count; one alone is a bad reply."""
+        if self._goes_on(sequence, asked):
+            raise Restarted(f"status: the sequence goes on from {sequence}: the controller was restarted")
+
+    def _goes_on(self, sequence: int, asked: Asked) -> bool:
+        """Tell whether this reply goes on from the doubted one before it; it is the doubted one from now on."""
         doubted, self._doubted = self._doubted, (sequence, asked)
         if doubted is None:
-            return
+            return False
         least_s, most_s = _passed_s(doubted[1], asked)
-        if max(least_s, self._map.tick_s) <= ((sequence - doubted[0]) % 2**32) * self._map.tick_s <= most_s:
-            raise Restarted(f"status: the sequence goes on from {sequence}: the controller was restarted")
+        passed_s = ((sequence - doubted[0]) % 2**32) * self._map.tick_s
+        return max(least_s, self._map.tick_s) <= passed_s <= most_s
 
 
 def _passed_s(last: Asked, asked: Asked) -> tuple[float, float]:

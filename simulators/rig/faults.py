@@ -51,11 +51,11 @@ class FaultyLine:
     tell: Callable[[str, dict[str, object]], None] = lambda _kind, _facts: None
     injected_count: int = 0
     _before: bytes = b""
-    _still: list[int] = field(default_factory=list)
     _serial: bool = False
 
     def __post_init__(self) -> None:
         self.rng = random.Random(self.seed)
+        self._still: list[int] = [0] * (STATUS_WORDS - 1)
 
     def serve(self, request: Request, device: Controller, serial: bool) -> Delivery:
         """Answer one request, or what a bad day makes of it."""
@@ -165,7 +165,7 @@ class FaultyLine:
     def _edited(self, request: Request, device: Controller, edit: Callable[[list[int]], list[int]]) -> Delivery:
         """Change the words of a status reply and put the right check under them; other replies go out as they are."""
         pdu = answer(request.pdu, device)
-        if pdu[0] in (3, 23) and pdu[1] == 2 * STATUS_WORDS and self._still:
+        if pdu[0] in (3, 23) and pdu[1] == 2 * STATUS_WORDS:
             words = edit([int.from_bytes(pdu[k : k + 2], "big") for k in range(2, len(pdu), 2)][:-1])
             words = [*words[: STATUS_WORDS - 1], R.status_check(words[: STATUS_WORDS - 1])]
             pdu = pdu[:2] + b"".join(word.to_bytes(2, "big") for word in words)
