@@ -19,6 +19,8 @@ sys.path.insert(0, str(ROOT))
 MODELS = {
     "bench": "fabctl.config.bench:BenchConfig",
     "material": "fabctl.config.material:MaterialConfig",
+    "method": "fabctl.config.method:MethodConfig",
+    "rig": "fabctl.config.rig:RigMapConfig",
 }
 
 

@@ -13,7 +13,7 @@ from fabctl.cli.common import bench_option, confirm, json_option, lab, show, yes
 if TYPE_CHECKING:
     from drivers.rig.indenter import Indenter
     from drivers.rig.samples import Sample
-    from fabctl.config.bench import RigConfig
+    from fabctl.bench import Bench
 
 JOG_FORCE_N = 1.0  # an operator's hand-driven motion stops at the first touch
 
@@ -121,8 +121,75 @@ def clear(bench_name: str, yes: bool, as_json: bool) -> None:
     show(_state(after), as_json, [f"{after.state}, faults: {', '.join(after.faults) or 'none'}"])
 
 
+@command.group()
+def calibrate() -> None:
+    """Calibrate the load cell with masses, or the frame with a rigid block."""
+
+
+@calibrate.command("force")
+@click.option("--mass-g", "masses_g", type=float, multiple=True, default=(0, 100, 200, 500), show_default=True)
+@click.option("--valid-days", default=365, show_default=True, help="After how many days it is past its date.")
+@bench_option
+@yes_option
+@json_option
+def calibrate_force_command(
+    masses_g: tuple[float, ...], valid_days: int, bench_name: str, yes: bool, as_json: bool
+) -> None:
+    """Lay known masses on the cell, one after the other; nothing moves."""
+    from fabctl.cli.common import progress
+    from fabctl.errors import Stopped
+    from fabctl.indent.calibrate import calibrate_force, hang_in_slot
+
+    with _rig(bench_name, "calibrating the load cell") as (rig, bench):
+        slot = bench.slot
+
+        def put_on(mass_kg: float) -> None:
+            if slot is not None:
+                hang_in_slot(slot, mass_kg)
+            elif not confirm(f"Lay {1000 * mass_kg:g} g on the cell. Done?", yes):
+                raise Stopped("not calibrated")
+
+        masses_kg = [mass / 1000 for mass in masses_g]
+        try:
+            run, body = calibrate_force(lab().root, bench.config.name, rig, masses_kg, put_on, progress(), valid_days)
+        finally:
+            if slot is not None:
+                hang_in_slot(slot, 0.0)
+    lines = [f"gain {body['gain_ratio']:.5f} ± {2 * body['gain_se_ratio']:.5f} (k = 2), zero {body['zero_N']:.4f} N"]
+    show({"run": run.run_id, **body}, as_json, lines)
+
+
+@calibrate.command("frame")
+@click.option("--force-N", "force_N", default=8.0, show_default=True, help="How hard to press the block.")
+@click.option("--block-mm-N", "block_mm_N", default=0.0, show_default=True, help="What the block itself gives.")
+@click.option("--valid-days", default=365, show_default=True)
+@bench_option
+@yes_option
+@json_option
+def calibrate_frame_command(
+    force_N: float, block_mm_N: float, valid_days: int, bench_name: str, yes: bool, as_json: bool
+) -> None:
+    """Press a rigid block three times: what gives way is the frame."""
+    from fabctl.cli.common import progress
+    from fabctl.errors import Stopped
+    from fabctl.indent.calibrate import block_in_slot, calibrate_frame
+
+    if not confirm(f"A rigid block lies under the indenter; press it with {force_N:g} N?", yes):
+        raise Stopped("not calibrated")
+    with _rig(bench_name, "calibrating the frame") as (rig, bench):
+        if bench.slot is not None:
+            block_in_slot(bench.slot)
+        assert bench.config.rig is not None
+        run, body = calibrate_frame(
+            lab().root, bench.config.name, rig, bench.config.rig, force_N, progress(), block_mm_N, valid_days
+        )
+    twice = 2 * body["compliance_se_mm_N"]
+    lines = [f"frame {body['compliance_mm_N']:.5f} ± {twice:.5f} mm/N (k = 2), {body['curves_count']} curves"]
+    show({"run": run.run_id, **body}, as_json, lines)
+
+
 @contextmanager
-def _rig(bench_name: str, purpose: str) -> Iterator[tuple[Indenter, RigConfig]]:
+def _rig(bench_name: str, purpose: str) -> Iterator[tuple[Indenter, Bench]]:
     """Lend the bench's rig."""
     from contextlib import closing
 
@@ -140,7 +207,7 @@ def _rig(bench_name: str, purpose: str) -> Iterator[tuple[Indenter, RigConfig]]:
         open_bench(place, config, purpose) as bench,
         closing(open_indenter(bench.url("rig"), registers)) as rig,
     ):
-        yield rig, config.rig
+        yield rig, bench
 
 
 def _moved(bench_name: str, word: str, question: str, yes: bool, as_json: bool, begin: Any) -> None:
@@ -150,7 +217,9 @@ def _moved(bench_name: str, word: str, question: str, yes: bool, as_json: bool, 
 
     if not confirm(question, yes):
         raise Stopped("not moved")
-    with _rig(bench_name, f"{word} of the rig") as (rig, config):
+    with _rig(bench_name, f"{word} of the rig") as (rig, bench):
+        config = bench.config.rig
+        assert config is not None
         rig.clear_faults()
         rig.set_limits(Limits(config.force_limit_N, -2.0, 0.0, config.travel_mm, 0.5, 50.0, 0.5))
         try:

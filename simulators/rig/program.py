@@ -7,6 +7,7 @@ import json
 import random
 import signal
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,7 @@ class Slot:
 
     def look(self, device: Controller) -> None:
         """Put what lies in the slot on the rig, where it is something new."""
-        mass = self._path("mass_kg.txt")
-        device.hung_N = read_mass_kg(mass) * GRAVITY_N_KG if mass is not None else 0.0
+        self.weigh(device)
         response = self._path("response.csv")
         stat = response.stat() if response is not None else None
         seen = (stat.st_mtime_ns, stat.st_size, stat.st_ino) if stat else "none"
@@ -69,7 +69,12 @@ class Slot:
         if curves is None and self._words.specimen:
             curves = BY_NAME[self._words.specimen]()
         device.specimen = specimen_of(curves, self._words) if curves else None
-        self._truth.key(answer_key(device, curves, str(response or self._words.specimen)))
+        self._truth.key(answer_key(device, curves, str(response or self._words.specimen), self._words.loss))
+
+    def weigh(self, device: Controller) -> None:
+        """Put the mass that lies in the slot on the load cell."""
+        mass = self._path("mass_kg.txt")
+        device.hung_N = read_mass_kg(mass) * GRAVITY_N_KG if mass is not None else 0.0
 
     def _path(self, name: str) -> Path | None:
         return self._folder / name if self._folder is not None and (self._folder / name).is_file() else None
@@ -77,10 +82,12 @@ class Slot:
 
 def specimen_of(curves: Curves, words: argparse.Namespace) -> Specimen:
     """Return a fresh specimen with the rubber's history effects asked for."""
+    unload = [(1 - words.loss) * force for force in curves.unload_N] if words.loss else curves.unload_N
+    curves = Curves(curves.step_mm, curves.load_N, unload)
     return Specimen(curves, virgin_ratio=words.virgin, creep_ratio=words.creep, creep_s=words.creep_s)
 
 
-def answer_key(device: Controller, curves: Curves | None, source: str) -> dict[str, Any]:
+def answer_key(device: Controller, curves: Curves | None, source: str, loss_ratio: float) -> dict[str, Any]:
     """Return the true values behind what the rig will show."""
     m = device.machine
     return {
@@ -93,6 +100,7 @@ def answer_key(device: Controller, curves: Curves | None, source: str) -> dict[s
         "noise_N": m.noise_N,
         "drift_N_s": m.drift_N_s,
         "backlash_mm": m.backlash_mm,
+        "loss_ratio": loss_ratio,
         "secant_2mm_N_mm": curves.load_N[round(2 / curves.step_mm)] / 2 if curves and curves.depth_max_mm > 2 else None,
     }
 
@@ -117,6 +125,9 @@ def parse(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--contact-mm", type=float, help="[drawn, 5 to 7 mm below home]")
     parser.add_argument("--compliance-mm-N", type=float, default=0.02)
     parser.add_argument("--backlash-mm", type=float, default=0.004)
+    parser.add_argument(
+        "--loss", type=float, default=0.06, help="share of the force that the rubber keeps on the way out"
+    )
     parser.add_argument("--virgin", type=float, default=0.0, help="what a first loading costs more, as a share")
     parser.add_argument("--creep", type=float, default=0.0, help="share of the force that relaxes")
     parser.add_argument("--creep-s", type=float, default=5.0)
@@ -153,7 +164,8 @@ def main(words: list[str]) -> int:
     truth = Truth(options.truth)
     device = Controller(drawn(options), seed=options.seed)
     device.tell = lambda kind, facts: truth.event(device.tick_count, kind, facts)
-    device.on_arm = Slot(options.slot, options, truth).look
+    slot = Slot(options.slot, options, truth)
+    device.on_arm = slot.look
     line = FaultyLine(
         options.fault_rate,
         [kind for kind in options.faults.split(",") if kind],
@@ -162,7 +174,14 @@ def main(words: list[str]) -> int:
         device.tell,
     )
     pace = Pace(options.baud if options.rtu else 0, 11, options.turnaround_ms / 1e3 if options.rtu else 0.0)
-    server = Server(device, line, pace, options.unit)
+    weighed_s = [0.0]
+
+    def now_and_then() -> None:
+        if time.monotonic() - weighed_s[0] > 0.1:
+            weighed_s[0] = time.monotonic()
+            slot.weigh(device)
+
+    server = Server(device, line, pace, options.unit, each_turn=now_and_then)
     stopped: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda got, _frame: stopped.append(got))
