@@ -1,0 +1,122 @@
+"""Where on the machine the sheet lies: an affine map from sheet to machine coordinates, and the program laid there.
+
+The work offset is only read, never written: the program itself is moved, so that nothing on the board changes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from drivers.grbl.messages import Vector
+from drivers.grbl.settings import Identity
+from fabctl.cut.program import WORD, decimal, read_program, strip
+from fabctl.errors import UsageError
+
+Origin = Literal["here", "home", "camera"]
+RIGID_RATIO = 0.02  # a camera map that stretches more than this is a mistake, not a bed
+
+
+@dataclass(frozen=True, slots=True)
+class Affine:
+    """machine = (a b; d e) · sheet + (c, f), in mm."""
+
+    a: float = 1.0
+    b: float = 0.0
+    c_mm: float = 0.0
+    d: float = 0.0
+    e: float = 1.0
+    f_mm: float = 0.0
+
+    def at(self, point_mm: tuple[float, float]) -> tuple[float, float]:
+        """Return the machine place of a sheet place."""
+        x, y = point_mm
+        return self.a * x + self.b * y + self.c_mm, self.d * x + self.e * y + self.f_mm
+
+    def turned(self, vector_mm: tuple[float, float]) -> tuple[float, float]:
+        """Return a difference of places, without the shift."""
+        x, y = vector_mm
+        return self.a * x + self.b * y, self.d * x + self.e * y
+
+
+def travel_box_mm(identity: Identity, travel_mm: tuple[float, float]) -> tuple[float, float, float, float]:
+    """Return the machine's travel (x low, y low, x high, y high): minus travel to 0, unless it homes to zero.
+
+    The board's own `$130/$131` count; `travel_mm` of the bench file where the board does not tell.
+    """
+    width = identity.setting(130) or travel_mm[0]
+    height = identity.setting(131) or travel_mm[1]
+    if identity.homes_to_zero:
+        mask = int(identity.setting(23) or 0)
+        x = (0.0, width) if mask & 1 else (-width, 0.0)
+        y = (0.0, height) if mask & 2 else (-height, 0.0)
+    else:
+        x, y = (-width, 0.0), (-height, 0.0)
+    return x[0], y[0], x[1], y[1]
+
+
+def placement(
+    origin: Origin,
+    identity: Identity,
+    travel_mm: tuple[float, float],
+    origin_mm: tuple[float, float],
+    head_mm: Vector | None,
+    camera_file: Path | None = None,
+) -> Affine:
+    """Return the map that `--origin` means.
+
+    `home`: the sheet's corner lies `origin_mm` from the lower left corner of the travel; `here`: where the head is;
+    `camera`: as the calibrated bed camera measured it.
+    """
+    if origin == "camera":
+        if camera_file is None or not camera_file.is_file():
+            raise UsageError("--origin camera needs the bed alignment; make it with `fabctl camera`")
+        return read_affine(camera_file)
+    if origin == "here":
+        if head_mm is None:
+            raise UsageError("--origin here: the board does not report where the head is")
+        return Affine(c_mm=head_mm[0], f_mm=head_mm[1])
+    box = travel_box_mm(identity, travel_mm)
+    return Affine(c_mm=box[0] + origin_mm[0], f_mm=box[1] + origin_mm[1])
+
+
+def read_affine(path: Path) -> Affine:
+    """Return the map in a JSON file: `sheet_to_machine`, two rows of three numbers."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        rows = data["sheet_to_machine"] if isinstance(data, dict) else data
+        (a, b, c), (d, e, f) = ([float(value) for value in row] for row in rows)
+    except (OSError, ValueError, KeyError, TypeError) as fault:
+        raise UsageError(f"{path}: no sheet_to_machine of two rows with three numbers: {fault}") from fault
+    if not all(map(math.isfinite, (a, b, c, d, e, f))):
+        raise UsageError(f"{path}: the map is not finite")
+    scale = math.sqrt(abs(a * e - b * d))
+    if not abs(scale - 1) <= RIGID_RATIO:
+        raise UsageError(f"{path}: the map scales by {scale:.4f}; a bed does not. Align it again")
+    return Affine(a, b, c, d, e, f)
+
+
+def lay(lines: Sequence[str], affine: Affine, work_offset_mm: Vector) -> tuple[str, ...]:
+    """Return the program in the board's work coordinates, so that it runs where `affine` puts the sheet."""
+    program = read_program(lines)
+    out = []
+    for index, line in enumerate(program.lines):
+        words = WORD.findall(strip(line))
+        letters = {letter for letter, _ in words}
+        if not {"X", "Y"} & letters:
+            out.append(line)
+            continue
+        x, y = affine.at(program.modes[index].position_mm)
+        place = {"X": x - work_offset_mm[0], "Y": y - work_offset_mm[1]}
+        if {"I", "J"} & letters:
+            values = {letter: float(number) for letter, number in words if letter in "IJ"}
+            i, j = affine.turned((values.get("I", 0.0), values.get("J", 0.0)))
+            place |= {"I": i, "J": j}
+        head = "".join(a + b for a, b in words if a in "GM")
+        tail = "".join(a + b for a, b in words if a not in "GMXYIJ")
+        out.append(head + "".join(letter + decimal(value) for letter, value in place.items()) + tail)
+    return tuple(out)
