@@ -92,7 +92,7 @@ def head_mm(report: Report | None, work_offset_mm: Vector) -> tuple[float, float
 
 
 def with_air(lines: Sequence[str], identity: Identity, material: MaterialConfig) -> tuple[str, ...]:
-    """Return the program with air assist (M8) and exhaust (M7) on before the beam and off at the end, as the preset says.
+    """Return the program with air assist (M8) and exhaust (M7) on before the beam and off at its end, per the preset.
 
     M7 only where the board has it; elsewhere the exhaust is the operator's switch.
     """

@@ -1,0 +1,319 @@
+"""One cut from design to record: connect, plan, check, ask once, home, dry-check, frame, cut, write down. **W**
+
+Everything is asked before the first motion. On every way out the beam is off and the record says how it ended.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from design.findings import Finding, errors
+from drivers.clock import WallClock
+from drivers.errors import DeviceError
+from drivers.grbl.laser import Laser
+from drivers.grbl.messages import Report
+from drivers.grbl.run import StoppedByOperator, Wish, run_program
+from drivers.grbl.settings import Identity
+from drivers.transport import open_transport
+from drivers.transport.tap import Tap
+from fabctl.bench import Bench
+from fabctl.config.bench import LaserConfig
+from fabctl.config.material import MaterialConfig
+from fabctl.cut.execute import CutWatch, check_on_board, minutes, no_keys, run_plan
+from fabctl.cut.place import Affine, Origin, placement
+from fabctl.cut.plan import CutPlan, frame_lines, plan_cut, program_times
+from fabctl.cut.preflight import Sheet
+from fabctl.cut.program import read_program
+from fabctl.cut.progress import Track
+from fabctl.cut.wirelog import WireLog
+from fabctl.errors import FabctlError, RefusedError, Stopped, UsageError
+from fabctl.events import Emit, Event
+from fabctl.records.folder import RunFolder, start_run, write_atomically
+from fabctl.workspace import Specimen, Workspace
+
+SAMPLE_ID = "S-0000"  # stands for the id until the operator has said yes
+
+Compose = Callable[[str, float], tuple[str, ...]]
+"""From the specimen's id and the board's full power ($30) to G-code lines in sheet coordinates."""
+
+
+@dataclass(frozen=True, slots=True)
+class CutOrder:
+    """What is to be cut, how, and where."""
+
+    design: Path
+    compose: Compose
+    material: MaterialConfig
+    sheet: Sheet | None = None
+    origin: Origin = "home"
+    camera_file: Path | None = None
+    frame: bool = False
+    frame_power_frac: float = 0.0
+    home: bool = True
+    check: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """Whoever sits before the machine: answers questions, presses keys, hears events."""
+
+    ask: Callable[[str], bool]
+    emit: Emit
+    keys: Callable[[], Wish] = no_keys
+
+
+@dataclass(frozen=True, slots=True)
+class CutDone:
+    """A finished cut, or a finished dry run (then without specimen and run)."""
+
+    plan: CutPlan
+    specimen: Specimen | None
+    run: RunFolder | None
+    result: dict[str, Any]
+
+
+@contextmanager
+def laser_on(bench: Bench, log: WireLog | None = None) -> Iterator[Laser]:
+    """Open the bench's laser, connected and dark; off again afterwards, whatever happened."""
+    clock = WallClock()
+    transport = open_transport(bench.url("laser"))
+    with Laser(Tap(transport, log.note, clock) if log is not None else transport, clock) as laser:
+        laser.connect()
+        yield laser
+
+
+def laser_config(bench: Bench) -> LaserConfig:
+    """Return the bench's laser section; raise `UsageError` where it has none."""
+    if bench.config.laser is None:
+        raise UsageError(f"bench {bench.config.name} has no laser; add one to its file")
+    return bench.config.laser
+
+
+def cut(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, dry_run: bool = False) -> CutDone:
+    """Cut `order` on `bench`; return what came of it.
+
+    Raises `RefusedError` with all findings before anything moves, `Stopped` where the operator said no or stopped it,
+    and the driver's errors where the device failed; in a run, the record says the same.
+    """
+    log = WireLog()
+    try:
+        with laser_on(bench, log) as laser:
+            plan = _plan(laser, bench, order, SAMPLE_ID)
+            _tell_findings(plan.findings, desk.emit)
+            _refuse(plan.findings)
+            if dry_run:
+                if order.check and laser.report().state == "Idle":
+                    check_on_board(laser, plan.lines)
+                return CutDone(plan, None, None, summary(plan, identity_of(laser)))
+            if not desk.ask(question(plan, order, laser_config(bench), homes(laser, bench, order))):
+                raise Stopped("not cut: the operator said no")
+            return _cut_now(lab, bench, order, desk, laser, log)
+    finally:
+        log.close()
+
+
+def identity_of(laser: Laser) -> Identity:
+    """Return who the connected board is."""
+    assert laser.identity is not None, "connect comes first"
+    return laser.identity
+
+
+def homes(laser: Laser, bench: Bench, order: CutOrder) -> bool:
+    """Return whether the job will home the machine first."""
+    config = laser_config(bench)
+    return order.home and config.homing and order.origin != "here" and identity_of(laser).is_on(22)
+
+
+def _plan(laser: Laser, bench: Bench, order: CutOrder, specimen: str) -> CutPlan:
+    config, identity = laser_config(bench), identity_of(laser)
+    report = laser.report()
+    will_home = homes(laser, bench, order)
+    if report.state == "Alarm" and not will_home:
+        found = Finding("CUT-LOCKED", "the board is locked: its position is not known", hint="fabctl laser home")
+        raise RefusedError("the cut cannot begin", [found])
+    affine = _affine(order, config, identity, report)
+    lines = order.compose(specimen, identity.setting(30) or 1000.0)
+    known = will_home or (identity.is_on(22) and report.state == "Idle")
+    return plan_cut(lines, affine, identity, report, config, order.material, order.sheet, known)
+
+
+def _affine(order: CutOrder, config: LaserConfig, identity: Identity, report: Report) -> Affine:
+    head = report.machine_mm
+    if order.origin == "home" and not identity.is_on(22):
+        # Without homing, zero is where the operator says it is: the work origin of the board.
+        dx, dy, _ = identity.work_offset_mm()
+        return Affine(c_mm=dx + config.origin_mm[0], f_mm=dy + config.origin_mm[1])
+    return placement(order.origin, identity, config.travel_mm, config.origin_mm, head, order.camera_file)
+
+
+def _tell_findings(findings: tuple[Finding, ...], emit: Emit) -> None:
+    for finding in findings:
+        if finding.level != "error":
+            emit(Event("finding", str(finding), data=finding.as_dict()))
+
+
+def _refuse(findings: tuple[Finding, ...]) -> None:
+    if errors(findings):
+        raise RefusedError("the cut cannot begin", errors(findings))
+
+
+def question(plan: CutPlan, order: CutOrder, config: LaserConfig, will_home: bool) -> str:
+    """Return the one screen before the first motion."""
+    preset = order.material.laser
+    bounds = plan.bounds_mm() or (0.0, 0.0, 0.0, 0.0)
+    focus = f", focus at {preset.focus_height_mm:g} mm" if preset is not None and preset.focus_height_mm else ""
+    first = "homes the machine, then cuts" if will_home else "cuts from the zero you have set"
+    return (
+        f"{order.design}\n"
+        f"  {order.material.name}, {order.material.thickness_mm:g} mm: on the bed, flat, clamped{focus}?\n"
+        f"  machine X {bounds[0]:.1f} to {bounds[2]:.1f}, Y {bounds[1]:.1f} to {bounds[3]:.1f} mm; "
+        f"{plan.burnt_mm() / 1000:.2f} m burnt, {len(plan.lines)} lines, {minutes(plan.times.total_s)}\n"
+        f"  {first}{', frames the job first' if order.frame else ''}; the board holds at most "
+        f"{config.max_run_on_s:g} s of work\n"
+        "  exhaust on, lid shut, glasses on, you stay beside it with the stop within reach. Start?"
+    )
+
+
+def summary(plan: CutPlan, identity: Identity) -> dict[str, Any]:
+    """Return the numbers of a plan, for the record and `--json`."""
+    bounds = plan.bounds_mm()
+    return {
+        "lines_count": len(plan.lines),
+        "burnt_mm": round(plan.burnt_mm(), 3),
+        "estimate_s": round(plan.times.total_s, 2),
+        "bounds_mm": [round(value, 3) for value in bounds] if bounds else None,
+        "job_sha256": plan.sha256,
+        "firmware": f"{identity.firmware} {identity.version}".strip(": "),
+        "findings": [finding.as_dict() for finding in plan.findings],
+    }
+
+
+def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: Laser, log: WireLog) -> CutDone:
+    specimen = lab.new_specimen(order.design)
+    plan = _plan(laser, bench, order, specimen.name)
+    _refuse(plan.findings)
+    run = start_run(
+        lab.runs,
+        "cut",
+        specimen=specimen.name,
+        inputs=design_files(specimen.design),
+        config={
+            "bench": bench.config.model_dump(mode="json"),
+            "material": order.material.model_dump(mode="json"),
+            "origin": order.origin,
+            "placement": [
+                [plan.affine.a, plan.affine.b, plan.affine.c_mm],
+                [plan.affine.d, plan.affine.e, plan.affine.f_mm],
+            ],
+            "plan": summary(plan, identity_of(laser)),
+        },
+    )
+    with recorded(run, laser, log, desk, plan) as tell:
+        if homes(laser, bench, order):
+            tell(Event("stage", "homing"))
+            laser.home()
+        result = execute(laser, plan, order, laser_config(bench), Desk(desk.ask, tell, desk.keys), run)
+    bench.lay(specimen.design)
+    return CutDone(plan, specimen, run, result)
+
+
+def design_files(design: Path) -> list[Path]:
+    """Return the files of a design folder, for the manifest."""
+    return sorted(path for path in design.iterdir() if path.is_file())
+
+
+@contextmanager
+def recorded(run: RunFolder, laser: Laser, log: WireLog, desk: Desk, plan: CutPlan) -> Iterator[Emit]:
+    """Keep the record of a run: job and wire while it runs, the outcome on every way out."""
+    write_atomically(run.artefact("job.nc"), plan.text)
+    log.write_to(run.path / "wire.log")
+    write_event = run.log_events()
+
+    def tell(event: Event) -> None:
+        write_event(event)
+        desk.emit(event)
+
+    try:
+        yield tell
+    except (KeyboardInterrupt, StoppedByOperator) as fault:
+        left = _left(laser)
+        run.finish("stopped", "stopped by the operator", **left)
+        raise Stopped(f"stopped; {run.run_id} says how far it came; fabctl cut run … --resume {run.run_id}") from fault
+    except FabctlError as fault:
+        run.finish("refused" if isinstance(fault, RefusedError) else "failed", str(fault), **_left(laser))
+        raise
+    except DeviceError as fault:
+        run.finish("failed", str(fault), fault=type(fault).__name__, **_left(laser))
+        raise
+    except BaseException as fault:
+        run.finish("failed", f"{type(fault).__name__}: {fault}", **_left(laser))
+        raise
+    run.finish("done")
+
+
+def _left(laser: Laser) -> dict[str, Any]:
+    """Make sure the beam is off, and return how the machine was left."""
+    left = laser.left or laser.off()
+    return {
+        "beam_off_confirmed": left.confirmed,
+        "position_known": left.position_known,
+        "machine_mm": list(left.machine_mm) if left.machine_mm else None,
+    }
+
+
+def execute(
+    laser: Laser, plan: CutPlan, order: CutOrder, config: LaserConfig, desk: Desk, run: RunFolder
+) -> dict[str, Any]:
+    """Check on the board, frame if asked, cut; return the numbers of the run."""
+    if order.check:
+        desk.emit(Event("stage", f"checking {len(plan.lines)} lines on the board"))
+        check_on_board(laser, plan.lines)
+        recheck_offset(laser, plan)
+    if order.frame:
+        frame(laser, plan, order, config, desk)
+    desk.emit(Event("stage", f"cutting, {minutes(plan.times.total_s)}"))
+    began_s = time.monotonic()
+    progress, _ = run_plan(laser, plan, config.max_run_on_s, desk.emit, desk.keys)
+    actual_s = time.monotonic() - began_s
+    result = {
+        **summary(plan, identity_of(laser)),
+        "actual_s": round(actual_s, 2),
+        "answered_count": progress.answered_count,
+        "nul_count": laser.link.listener.nul_count,
+        "garbled_count": len(laser.link.garbled),
+    }
+    run.write_result(result)
+    desk.emit(Event("stage", f"cut in {minutes(actual_s)} (estimated {minutes(plan.times.total_s)})"))
+    return result
+
+
+def recheck_offset(laser: Laser, plan: CutPlan) -> None:
+    """Check mode restarts the board: the work offset must still be the one the plan was made for."""
+    from drivers.grbl.messages import Info
+    from drivers.grbl.settings import identify
+
+    answers = [m for m in (*laser.ask("$#"), *laser.ask("$G")) if isinstance(m, Info)]
+    laser.end()
+    now = identify(answers, None).work_offset_mm()
+    if any(abs(a - b) > 0.0005 for a, b in zip(now, plan.work_offset_mm, strict=True)):
+        found = Finding(
+            "CUT-OFFSET", f"the work offset changed from {plan.work_offset_mm} to {now}", hint="start again"
+        )
+        raise RefusedError("the cut cannot begin", [found])
+
+
+def frame(laser: Laser, plan: CutPlan, order: CutOrder, config: LaserConfig, desk: Desk) -> None:
+    """Go once around the job, dark or at low power, and ask whether it fits."""
+    desk.emit(Event("stage", "framing"))
+    full = identity_of(laser).setting(30) or 1000.0
+    program = read_program(frame_lines(plan, order.frame_power_frac * full))
+    around = CutPlan(program, program_times(program, identity_of(laser)), plan.affine, plan.work_offset_mm, ())
+    track = Track(program, around.times, config.max_run_on_s)
+    run_program(laser, around.lines, CutWatch(around, track, desk.emit, desk.keys))
+    if not desk.ask("The head went around the job. Does it fit the sheet?"):
+        raise Stopped("not cut: the frame did not fit")
