@@ -87,7 +87,7 @@ class Report:
     work_mm: Vector | None = None
     offset_mm: Vector | None = None
     feed_mm_min: float | None = None
-    speed: float | None = None
+    s_count: float | None = None
     free_blocks: int | None = None
     free_bytes: int | None = None
     overrides: tuple[int, int, int] | None = None
@@ -177,7 +177,7 @@ def _field(name: str, text: str) -> dict[str, object]:
         return {key: (parts[0], parts[1], parts[2] if len(parts) > 2 else 0.0)}
     if name == "FS":
         feed, speed = text.split(",")[:2]
-        return {"feed_mm_min": float(feed), "speed": float(speed)}
+        return {"feed_mm_min": float(feed), "s_count": float(speed)}
     if name == "F":
         return {"feed_mm_min": float(text)}
     if name == "Bf":

@@ -12,6 +12,10 @@ RX_LEAST_BYTES = 16
 PLANNER_FALLBACK_COUNT = 15
 
 
+class Settings(dict[int, float]):
+    """The `$` settings by number; each in the unit that the board gives it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Identity:
     """The board: firmware, options, buffers, settings, offsets, start-up lines."""
@@ -21,7 +25,7 @@ class Identity:
     options: str
     rx_bytes: int
     planner_count: int
-    settings: dict[int, float] = field(default_factory=dict)
+    settings: Settings = field(default_factory=lambda: Settings())
     offsets_mm: dict[str, Vector] = field(default_factory=dict)
     modes: str = ""
     startup: tuple[str, ...] = ()
@@ -61,7 +65,7 @@ def identify(messages: Iterable[Message], idle: Report | None) -> Identity:
     version = options = modes = ""
     firmware = "grbl"
     fields: list[str] = []
-    settings: dict[int, float] = {}
+    settings = Settings()
     offsets: dict[str, Vector] = {}
     startup: list[str] = []
     for message in messages:

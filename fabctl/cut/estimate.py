@@ -53,10 +53,10 @@ class Estimate:
 class _Block:
     step: int
     length_mm: float
-    unit: tuple[float, float]
+    unit_ratio: tuple[float, float]
     nominal_mm_s: float
     acceleration_mm_s2: float
-    corner_sq: float = 0.0
+    corner_mm2_s2: float = 0.0
 
 
 def estimate(steps: Sequence[Step], dynamics: Dynamics, byte_count: int = 0, baud: int = 115200) -> Estimate:
@@ -72,7 +72,7 @@ def estimate(steps: Sequence[Step], dynamics: Dynamics, byte_count: int = 0, bau
         ends[k] = clock_s
         if block is not None:
             if chain:
-                block.corner_sq = _corner_sq(chain[-1].unit, block.unit, dynamics)
+                block.corner_mm2_s2 = _corner_sq(chain[-1].unit_ratio, block.unit_ratio, dynamics)
             chain.append(block)
     clock_s = _run(chain, dynamics, clock_s, ends)
     _fill(ends)
@@ -127,7 +127,7 @@ def _entry_speeds_sq(chain: list[_Block], window: int) -> list[float]:
     limit = [0.0] * (n + 1)
     for k in range(1, n):
         slower = min(chain[k - 1].nominal_mm_s, chain[k].nominal_mm_s)
-        limit[k] = min(slower * slower, chain[k].corner_sq)
+        limit[k] = min(slower * slower, chain[k].corner_mm2_s2)
     speeds = list(limit)
     for k in range(n - 1, 0, -1):
         speeds[k] = min(speeds[k], speeds[k + 1] + 2 * chain[k].acceleration_mm_s2 * chain[k].length_mm)

@@ -147,7 +147,7 @@ def _affine(order: CutOrder, config: LaserConfig, identity: Identity, report: Re
     if order.origin == "home" and not identity.is_on(22):
         # Without homing, zero is where the operator says it is: the work origin of the board.
         dx, dy, _ = identity.work_offset_mm()
-        return Affine(c_mm=dx + config.origin_mm[0], f_mm=dy + config.origin_mm[1])
+        return Affine(x_mm=dx + config.origin_mm[0], y_mm=dy + config.origin_mm[1])
     return placement(order.origin, identity, config.travel_mm, config.origin_mm, head, order.camera_file)
 
 
@@ -206,10 +206,7 @@ def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: L
             "bench": bench.config.model_dump(mode="json"),
             "material": order.material.model_dump(mode="json"),
             "origin": order.origin,
-            "placement": [
-                [plan.affine.a, plan.affine.b, plan.affine.c_mm],
-                [plan.affine.d, plan.affine.e, plan.affine.f_mm],
-            ],
+            "placement": plan.affine.rows(),
             "plan": summary(plan, identity_of(laser)),
         },
     )

@@ -23,24 +23,28 @@ RIGID_RATIO = 0.02  # a camera map that stretches more than this is a mistake, n
 
 @dataclass(frozen=True, slots=True)
 class Affine:
-    """machine = (a b; d e) · sheet + (c, f), in mm."""
+    """machine = (xx xy; yx yy) · sheet + (x, y), in mm."""
 
-    a: float = 1.0
-    b: float = 0.0
-    c_mm: float = 0.0
-    d: float = 0.0
-    e: float = 1.0
-    f_mm: float = 0.0
+    xx_ratio: float = 1.0
+    xy_ratio: float = 0.0
+    x_mm: float = 0.0
+    yx_ratio: float = 0.0
+    yy_ratio: float = 1.0
+    y_mm: float = 0.0
 
     def at(self, point_mm: tuple[float, float]) -> tuple[float, float]:
         """Return the machine place of a sheet place."""
         x, y = point_mm
-        return self.a * x + self.b * y + self.c_mm, self.d * x + self.e * y + self.f_mm
+        return self.xx_ratio * x + self.xy_ratio * y + self.x_mm, self.yx_ratio * x + self.yy_ratio * y + self.y_mm
+
+    def rows(self) -> list[list[float]]:
+        """Return the map as two rows of three numbers."""
+        return [[self.xx_ratio, self.xy_ratio, self.x_mm], [self.yx_ratio, self.yy_ratio, self.y_mm]]
 
     def turned(self, vector_mm: tuple[float, float]) -> tuple[float, float]:
         """Return a difference of places, without the shift."""
         x, y = vector_mm
-        return self.a * x + self.b * y, self.d * x + self.e * y
+        return self.xx_ratio * x + self.xy_ratio * y, self.yx_ratio * x + self.yy_ratio * y
 
 
 def travel_box_mm(identity: Identity, travel_mm: tuple[float, float]) -> tuple[float, float, float, float]:
@@ -79,9 +83,9 @@ def placement(
     if origin == "here":
         if head_mm is None:
             raise UsageError("--origin here: the board does not report where the head is")
-        return Affine(c_mm=head_mm[0], f_mm=head_mm[1])
+        return Affine(x_mm=head_mm[0], y_mm=head_mm[1])
     box = travel_box_mm(identity, travel_mm)
-    return Affine(c_mm=box[0] + origin_mm[0], f_mm=box[1] + origin_mm[1])
+    return Affine(x_mm=box[0] + origin_mm[0], y_mm=box[1] + origin_mm[1])
 
 
 def read_affine(path: Path) -> Affine:

@@ -43,21 +43,21 @@ class Board:
     rx_bytes: int = RX_BYTES
     rx_lost_count: int = 0
     _rx: deque[int] = field(default_factory=deque)
-    _wire_in: list[tuple[float, int, int]] = field(default_factory=list)
     _wire_free_s: float = 0.0
-    _wire_out: deque[tuple[float, bytes]] = field(default_factory=deque)
     _out_free_s: float = 0.0
     _deaf_until_s: float = 0.0
     _deaf_count: int = 0
     _wake_s: float = 0.0
     _last_point: Point | None = None
-    _order: itertools.count[int] = field(default_factory=itertools.count)
 
     def __post_init__(self) -> None:
         m = self.machine
         m.say, m.read, m.flush_rx, m.go_deaf = self._say, self._read, self._rx.clear, self._go_deaf
         m.rx_free = lambda: self.rx_bytes - len(self._rx)
         self._program = program(m)
+        self._wire_in: list[tuple[float, int, int]] = []  # arrival, order, byte
+        self._wire_out: deque[tuple[float, bytes]] = deque()  # departure, bytes
+        self._order = itertools.count()
         self._byte_s = BITS_PER_BYTE / self.baud if self.baud else 0.0
         self._run()
 

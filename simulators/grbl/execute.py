@@ -28,8 +28,8 @@ def run_line(m: Machine, line: str) -> Status:
         return (yield from _jog(m, block))
     yield from _set_speed(m, block)
     modes = block.modes
-    power = block.speed if modes.motion in (1, 2, 3) or not m.memory.on(32) else 0.0
-    m.parser = replace(m.parser, feed=block.feed, speed=block.speed, tool=block.tool)
+    power = block.s_count if modes.motion in (1, 2, 3) or not m.memory.on(32) else 0.0
+    m.parser = replace(m.parser, feed_mm_min=block.feed_mm_min, s_count=block.s_count, tool=block.tool)
     if m.parser.modes.spindle != modes.spindle:
         yield from spindle_sync(m, modes.spindle, power)
     if m.parser.modes.coolant != modes.coolant:
@@ -59,8 +59,8 @@ def _set_speed(m: Machine, block: Block) -> Program:
     cuts = block.modes.motion in (1, 2, 3)
     is_motion = laser and block.has_axes and block.axis_command == "motion"
     force = laser and not is_motion and now.spindle == 3 and (now.motion in (1, 2, 3)) != cuts
-    if (m.parser.speed != block.speed or force) and now.spindle != 5 and not is_motion:
-        yield from spindle_sync(m, now.spindle, 0.0 if laser and not cuts else block.speed)
+    if (m.parser.s_count != block.s_count or force) and now.spindle != 5 and not is_motion:
+        yield from spindle_sync(m, now.spindle, 0.0 if laser and not cuts else block.s_count)
 
 
 def _set_offsets(m: Machine, block: Block) -> None:
@@ -135,12 +135,12 @@ def line_to(m: Machine, target_mm: Vector, block: Block, power: float, rapid: bo
     built = m.planner.build(
         target_mm,
         m.planner.position_steps,
-        block.feed,
+        block.feed_mm_min,
         block.modes.feed_mode == 93,
         m.parser.modes.spindle,
         power,
         rapid,
-        block.jog or 38 <= block.modes.motion < 39,
+        block.jog or block.modes.motion > 380,
     )
     if built is not None:
         m.planner.add(*built)
@@ -204,7 +204,7 @@ def _arc(m: Machine, block: Block, power: float) -> Program:
     chord = math.sqrt(max(tolerance * (2 * block.radius_mm - tolerance), 1e-12))
     count = int(abs(0.5 * sweep * block.radius_mm) / chord)
     if count and block.modes.feed_mode == 93:
-        block.feed *= count
+        block.feed_mm_min *= count
         block.modes = replace(block.modes, feed_mode=94)
     for k in range(1, count):
         angle = sweep * k / count
@@ -235,7 +235,7 @@ def _probe(m: Machine, block: Block, power: float) -> Generator[float, None, boo
         if m.is_in(State.IDLE):
             break
         yield ANY
-    quiet = round(block.modes.motion * 10) in (383, 385)
+    quiet = block.modes.motion in (383, 385)
     if quiet:
         m.probe_steps = m.position_steps()
     else:
@@ -268,7 +268,7 @@ def _program_flow(m: Machine, flow: int) -> Program:
 def _jog(m: Machine, block: Block) -> Status:
     if m.memory.on(20) and outside_travel(m, block.target_mm):
         return TRAVEL_EXCEEDED
-    yield from line_to(m, block.target_mm, block, m.parser.speed, rapid=False)
+    yield from line_to(m, block.target_mm, block, m.parser.s_count, rapid=False)
     if m.state is State.IDLE and m.planner.moves:
         m.state = State.JOG
         wake(m)

@@ -34,9 +34,9 @@ class Fault(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Modes:
-    """The modal state, as `$G` shows it. `motion` is 0 to 3, 80, or 38.2 to 38.5."""
+    """The modal state, as `$G` shows it. `motion` is 0 to 3, 80, or 382 to 385 for G38.2 to G38.5."""
 
-    motion: float = 0
+    motion: int = 0
     system: int = 0
     plane: int = 17
     units: int = 21
@@ -53,8 +53,8 @@ class Parser:
     """Everything the parser remembers between lines."""
 
     modes: Modes = Modes()
-    feed: float = 0.0  # mm/min, or 1/min under G93
-    speed: float = 0.0
+    feed_mm_min: float = 0.0  # 1/min under G93
+    s_count: float = 0.0
     tool: int = 0
     position_mm: Vector = ZERO
     system_mm: Vector = ZERO
@@ -72,8 +72,8 @@ class Block:
     """A line that passed: its modes and what it asks for."""
 
     modes: Modes
-    feed: float = 0.0
-    speed: float = 0.0
+    feed_mm_min: float = 0.0
+    s_count: float = 0.0
     tool: int = 0
     has_axes: bool = False
     action: str = ""  # one of "", dwell, g10, g28, g30, g28.1, g30.1, g53, g92, g92.1
@@ -86,9 +86,13 @@ class Block:
     jog: bool = False
 
 
+class Values(dict[str, float]):
+    """Letter to number; each in the unit its letter has."""
+
+
 @dataclass(slots=True)
 class _Words:
-    values: dict[str, float] = field(default_factory=dict)
+    values: Values = field(default_factory=lambda: Values())
     groups: set[str] = field(default_factory=set)
     axis_command: str = ""
     action: str = ""
@@ -111,7 +115,7 @@ def parse(line: str, parser: Parser, memory: Memory) -> Block:
         raise Fault(LINE_NUMBER)
     used = set("NF") if jog else set("NFST")
     _set_feed(block, words, parser)
-    block.speed = words.values.get("S", parser.speed)
+    block.s_count = words.values.get("S", parser.s_count)
     block.tool = int(words.values.get("T", 0))
     if block.action == "dwell":
         if "P" not in words.values:
@@ -198,7 +202,7 @@ def _g_word(words: _Words, g: int, hundredths: int) -> tuple[str, int]:
         if g == 38:
             if hundredths not in (20, 30, 40, 50):
                 raise Fault(UNSUPPORTED)
-            words.modes = replace(words.modes, motion=38 + hundredths / 100)
+            words.modes = replace(words.modes, motion=380 + hundredths // 10)
             return "motion", 0
         words.modes = replace(words.modes, motion=g)
         return "motion", hundredths
@@ -253,17 +257,17 @@ def _m_word(words: _Words, m: int) -> tuple[str, int]:
 def _set_feed(block: Block, words: _Words, parser: Parser) -> None:
     given = "F" in words.values
     scale = MM_PER_INCH if block.modes.units == 20 else 1.0
-    block.feed = words.values.get("F", 0.0)
+    block.feed_mm_min = words.values.get("F", 0.0)
     if block.jog:
         if not given:
             raise Fault(NO_FEED)
-        block.feed *= scale
+        block.feed_mm_min *= scale
     elif block.modes.feed_mode == 93:
         needs_it = block.axis_command == "motion" and block.modes.motion not in (0, 80)
         if needs_it and not given:
             raise Fault(NO_FEED)
     elif parser.modes.feed_mode == 94:
-        block.feed = block.feed * scale if given else parser.feed
+        block.feed_mm_min = block.feed_mm_min * scale if given else parser.feed_mm_min
 
 
 def _millimetres(words: _Words) -> list[float]:
@@ -342,7 +346,7 @@ def _check_motion(block: Block, words: _Words, parser: Parser, used: set[str]) -
     if block.modes.motion == 0:
         block.axis_command = "motion" if words.axes else ""
         return
-    if block.feed == 0:
+    if block.feed_mm_min == 0:
         raise Fault(NO_FEED)
     if block.modes.motion == 1:
         block.axis_command = "motion" if words.axes else ""

@@ -111,7 +111,7 @@ class Machine:
     ov_count: int = 0
     parser: Parser = field(default_factory=Parser)
     pin: Pin = field(default_factory=Pin)
-    shown_speed: float = 0.0
+    shown_s_count: float = 0.0
     flood: bool = False
     probe_armed: bool = False
     probe_found: bool = False
@@ -140,12 +140,12 @@ class Machine:
         speed *= 0.01 * self.overrides.spindle
         low, high = self.memory[31], self.memory[30]
         if low >= high or speed >= high:
-            self.shown_speed = high
+            self.shown_s_count = high
             return 1.0
         if speed <= low:
-            self.shown_speed = low if speed else 0.0
+            self.shown_s_count = low if speed else 0.0
             return 1 / 255 if speed else 0.0
-        self.shown_speed = speed
+        self.shown_s_count = speed
         return (math.floor((speed - low) * 254 / (high - low)) + 1) / 255
 
     def spindle_off(self) -> None:
@@ -157,7 +157,7 @@ class Machine:
         if self.abort:
             return
         if mode == 5:
-            self.shown_speed = 0.0
+            self.shown_s_count = 0.0
             self.spindle_off()
         else:
             self.pin.ccw = mode == 4
@@ -231,7 +231,7 @@ class Machine:
         self.motion_override.clear()
         self.accessory_override.clear()
         self.wco_count = self.ov_count = 0
-        self.shown_speed, self.flood = 0.0, False
+        self.shown_s_count, self.flood = 0.0, False
         self.spindle_off()
         self.probe_steps, self.probe_found, self.probe_armed = (0, 0, 0), False, False
         self.flush_rx()

@@ -26,12 +26,12 @@ class Move:
     rapid_mm_s: float
     feed_mm_s: float
     spindle: int
-    speed: float
+    s_count: float
     rapid: bool
     no_override: bool
-    entry_sq: float = 0.0
-    max_entry_sq: float = 0.0
-    max_junction_sq: float = 0.0
+    entry_mm2_s2: float = 0.0
+    max_entry_mm2_s2: float = 0.0
+    max_junction_mm2_s2: float = 0.0
 
 
 def _nobody() -> None:
@@ -56,7 +56,7 @@ class Planner:
     moves: list[Move] = field(default_factory=list)
     planned: int = 0
     position_steps: tuple[int, int, int] = (0, 0, 0)
-    last_unit: Vector = (0.0, 0.0, 0.0)
+    last_unit_ratio: Vector = (0.0, 0.0, 0.0)
     last_nominal_mm_s: float = 0.0
     notify: Callable[[], None] = _nobody  # the running move's exit may change: the stepper must look again
 
@@ -68,7 +68,7 @@ class Planner:
     def reset(self, position_steps: tuple[int, int, int]) -> None:
         """Forget every move; stand at `position_steps`."""
         self.moves, self.planned, self.position_steps = [], 0, position_steps
-        self.last_unit, self.last_nominal_mm_s = (0.0, 0.0, 0.0), 0.0
+        self.last_unit_ratio, self.last_nominal_mm_s = (0.0, 0.0, 0.0), 0.0
 
     def build(
         self,
@@ -98,7 +98,7 @@ class Planner:
             rapid_mm_s=_limited(self.memory.axes(110), unit) / 60,
             feed_mm_s=feed_mm_s,
             spindle=spindle,
-            speed=speed,
+            s_count=speed,
             rapid=rapid,
             no_override=no_override,
         )
@@ -107,20 +107,20 @@ class Planner:
     def add(self, move: Move, unit: Vector, goal: tuple[int, int, int]) -> None:
         """Append `move` and plan again."""
         if self.moves:
-            move.max_junction_sq = self._junction_sq(unit)
+            move.max_junction_mm2_s2 = self._junction_sq(unit)
         nominal = self.nominal_mm_s(move)
         _limit_entry(move, nominal, self.last_nominal_mm_s)
-        self.last_nominal_mm_s, self.last_unit, self.position_steps = nominal, unit, goal
+        self.last_nominal_mm_s, self.last_unit_ratio, self.position_steps = nominal, unit, goal
         self.moves.append(move)
         self.plan()
 
     def _junction_sq(self, unit: Vector) -> float:
-        cosine = -sum(a * b for a, b in zip(self.last_unit, unit, strict=True))
+        cosine = -sum(a * b for a, b in zip(self.last_unit_ratio, unit, strict=True))
         if cosine > STRAIGHT:
             return 0.0
         if cosine < -STRAIGHT:
             return FAST
-        across, _ = _unit([b - a for a, b in zip(self.last_unit, unit, strict=True)])
+        across, _ = _unit([b - a for a, b in zip(self.last_unit_ratio, unit, strict=True)])
         acceleration = _limited(self.memory.axes(120), across)
         half_sine = math.sqrt(0.5 * (1.0 - cosine))
         return acceleration * self.memory[11] * half_sine / (1.0 - half_sine)
@@ -136,7 +136,7 @@ class Planner:
 
     def exit_sq(self) -> float:
         """Return the squared speed at which the running move hands over to the next; 0 at the end of the queue."""
-        return self.moves[1].entry_sq if len(self.moves) > 1 else 0.0
+        return self.moves[1].entry_mm2_s2 if len(self.moves) > 1 else 0.0
 
     def discard(self) -> None:
         """Drop the oldest move; the stepper has taken all of it."""
@@ -163,27 +163,29 @@ class Planner:
         moves, last = self.moves, len(self.moves) - 1
         if last <= self.planned:
             return
-        moves[last].entry_sq = min(moves[last].max_entry_sq, 2 * moves[last].acceleration_mm_s2 * moves[last].left_mm)
+        moves[last].entry_mm2_s2 = min(
+            moves[last].max_entry_mm2_s2, 2 * moves[last].acceleration_mm_s2 * moves[last].left_mm
+        )
         for k in range(last - 1, self.planned, -1):
             move = moves[k]
-            if move.entry_sq != move.max_entry_sq:
-                reachable = moves[k + 1].entry_sq + 2 * move.acceleration_mm_s2 * move.left_mm
-                move.entry_sq = min(reachable, move.max_entry_sq)
+            if move.entry_mm2_s2 != move.max_entry_mm2_s2:
+                reachable = moves[k + 1].entry_mm2_s2 + 2 * move.acceleration_mm_s2 * move.left_mm
+                move.entry_mm2_s2 = min(reachable, move.max_entry_mm2_s2)
         if self.planned == 0:
             self.notify()
         for k in range(self.planned, last):
             move, following = moves[k], moves[k + 1]
-            if move.entry_sq < following.entry_sq:
-                reachable = move.entry_sq + 2 * move.acceleration_mm_s2 * move.left_mm
-                if reachable < following.entry_sq:
-                    following.entry_sq = reachable
+            if move.entry_mm2_s2 < following.entry_mm2_s2:
+                reachable = move.entry_mm2_s2 + 2 * move.acceleration_mm_s2 * move.left_mm
+                if reachable < following.entry_mm2_s2:
+                    following.entry_mm2_s2 = reachable
                     self.planned = k + 1
-            if following.entry_sq == following.max_entry_sq:
+            if following.entry_mm2_s2 == following.max_entry_mm2_s2:
                 self.planned = k + 1
 
 
 def _limit_entry(move: Move, nominal: float, before: float) -> None:
-    move.max_entry_sq = min(min(nominal, before) ** 2, move.max_junction_sq)
+    move.max_entry_mm2_s2 = min(min(nominal, before) ** 2, move.max_junction_mm2_s2)
 
 
 def _round(value: float) -> int:

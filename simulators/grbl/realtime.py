@@ -193,7 +193,7 @@ def _accessory_overrides(m: Machine) -> None:
     if power != m.overrides.spindle:
         m.overrides.spindle = power
         if m.state is State.IDLE:
-            m.set_spindle(m.parser.modes.spindle, m.parser.speed)
+            m.set_spindle(m.parser.modes.spindle, m.parser.s_count)
         else:
             m.stepper.update_pin = True
         m.ov_count = 0
@@ -210,7 +210,7 @@ def _accessory_overrides(m: Machine) -> None:
 
 def _suspended(m: Machine) -> Program:
     move = m.planner.moves[0] if m.planner.moves else None
-    mode, speed = (move.spindle, move.speed) if move else (m.parser.modes.spindle, m.parser.speed)
+    mode, speed = (move.spindle, move.s_count) if move else (m.parser.modes.spindle, m.parser.s_count)
     flood = m.flood if move else m.parser.modes.coolant == 8
     if m.memory.on(32):
         m.accessory_override.append(0x9E)  # a hold in laser mode darkens the beam

@@ -25,7 +25,7 @@ def status(m: Machine) -> str:
     if mask & 2:
         fields.append(f"Bf:{BUFFER_BLOCKS - len(m.planner.moves)},{m.rx_free()}")
     speed = m.stepper.speed_mm_s * 60 if m.state in BUSY else 0.0
-    fields.append(f"FS:{rate(speed, inches)},{decimals(m.shown_speed, 0)}")
+    fields.append(f"FS:{rate(speed, inches)},{decimals(m.shown_s_count, 0)}")
     pins = "".join("XYZ"[k] for k in sorted(m.limits_hit()))
     if pins:
         fields.append(f"Pn:{pins}")
@@ -80,10 +80,10 @@ def probe(m: Machine) -> str:
 def modes(m: Machine) -> str:
     """Return the answer to `$G`."""
     p, now = m.parser, m.parser.modes
-    motion = f"G{now.motion:.1f}" if now.motion not in (0, 1, 2, 3, 80) else f"G{int(now.motion)}"
-    feed = rate(p.feed, m.memory.on(13))
+    motion = f"G38.{now.motion % 10}" if now.motion > 380 else f"G{now.motion}"
+    feed = rate(p.feed_mm_min, m.memory.on(13))
     words = [motion, f"G{54 + now.system}", f"G{now.plane}", f"G{now.units}", f"G{now.distance}", f"G{now.feed_mode}"]
-    words += [f"M{now.spindle}", f"M{now.coolant}", f"T{p.tool}", f"F{feed}", f"S{decimals(p.speed, 0)}"]
+    words += [f"M{now.spindle}", f"M{now.coolant}", f"T{p.tool}", f"F{feed}", f"S{decimals(p.s_count, 0)}"]
     return f"[GC:{' '.join(words)}]"
 
 

@@ -47,11 +47,15 @@ DEFAULTS: dict[int, tuple[str, float]] = {
 OK, BAD_NUMBER, INVALID, NEGATIVE, PULSE_TOO_SHORT, NEEDS_HOMING = 0, 2, 3, 4, 6, 10
 
 
+class Values(dict[int, float]):
+    """Setting number to value; each in the unit the setting has."""
+
+
 @dataclass
 class Memory:
     """The EEPROM. `pending_s` is how long the last writes keep the board deaf."""
 
-    values: dict[int, float] = field(default_factory=lambda: {n: v for n, (_, v) in DEFAULTS.items()})
+    values: Values = field(default_factory=lambda: Values((n, v) for n, (_, v) in DEFAULTS.items()))
     offsets_mm: list[tuple[float, float, float]] = field(default_factory=lambda: [(0.0, 0.0, 0.0)] * 8)
     startup: list[str] = field(default_factory=lambda: ["", ""])
     build_note: str = ""
@@ -105,7 +109,7 @@ class Memory:
         """Go back to the factory: `$` the settings, `#` the offsets, `*` everything."""
         before = self._image()
         if what in "$*":
-            self.values = {n: v for n, (_, v) in DEFAULTS.items()}
+            self.values = Values((n, v) for n, (_, v) in DEFAULTS.items())
         if what in "#*":
             for system in range(len(self.offsets_mm)):
                 self.store_offset(system, (0.0, 0.0, 0.0))

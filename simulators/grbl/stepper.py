@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from simulators.grbl.planner import Move, Planner
 from simulators.grbl.settings import Memory
@@ -20,6 +20,14 @@ LEAST_STEPS = 1.25  # a segment is stretched until it holds this much
 EPSILON_MM = 1e-9
 
 ACCELERATE, CRUISE, BRAKE, BRAKE_TO_CRUISE = range(4)
+
+
+class Duty(Protocol):
+    """From an S word to the pin's duty."""
+
+    def __call__(self, s_count: float, /) -> float:
+        """Return the duty, 0 to 1."""
+        ...
 
 
 @dataclass(slots=True)
@@ -63,7 +71,7 @@ class Stepper:
     planner: Planner
     memory: Memory
     pin: Pin
-    duty: Callable[[float], float]  # S word -> duty; also notes the speed that reports show
+    duty: Duty  # S word -> duty; also notes the speed that reports show
     position: tuple[int, int, int] = (0, 0, 0)
     system_move: Move | None = None
     holding: bool = False
@@ -84,10 +92,10 @@ class Stepper:
     _brake_after_mm: float = 0.0
     _top_mm_s: float = 0.0
     _exit_mm_s: float = 0.0
-    _steps_left: float = 0.0
+    _left_count: float = 0.0
     _steps_per_mm: float = 0.0
     _rest_s: float = 0.0
-    _duty: float = 0.0
+    _duty_frac: float = 0.0
     _stretch: Stretch | None = None
     _end: tuple[int, int, int] = (0, 0, 0)  # where the last stretch that was opened ends
 
@@ -104,7 +112,7 @@ class Stepper:
         self.awake = self.holding = self.ended = self.update_pin = False
         self._recalculate = self._brake_over = False
         self.system_move = self._move = self._stretch = None
-        self.speed_mm_s = self._duty = self._rest_s = 0.0
+        self.speed_mm_s = self._duty_frac = self._rest_s = 0.0
         self.locked = set()
         self._end = self.position
 
@@ -112,7 +120,7 @@ class Stepper:
         """Compute the running move's profile anew from the speed it has now; the planner asks for this."""
         if self._move is not None:
             self._recalculate = True
-            self._move.entry_sq = self.speed_mm_s**2
+            self._move.entry_mm2_s2 = self.speed_mm_s**2
             self._move = None
 
     def prepare(self) -> None:
@@ -134,15 +142,15 @@ class Stepper:
             dynamic = self.memory.on(32) and move.spindle == 4
             self._stretch = Stretch(self._end, move.steps, move.step_events, dynamic)
             self._end = self._stretch.at(move.step_events)
-            self._steps_left = float(move.step_events)
+            self._left_count = float(move.step_events)
             self._steps_per_mm = move.step_events / move.left_mm
             self._rest_s = 0.0
             if self.holding or self._brake_over:
                 self.speed_mm_s = self._exit_mm_s
-                move.entry_sq = self._exit_mm_s**2
+                move.entry_mm2_s2 = self._exit_mm_s**2
                 self._brake_over = False
             else:
-                self.speed_mm_s = math.sqrt(move.entry_sq)
+                self.speed_mm_s = math.sqrt(move.entry_mm2_s2)
         self._profile(move)
         self.update_pin = True
         return True
@@ -155,9 +163,9 @@ class Stepper:
         per_2a = 0.5 / move.acceleration_mm_s2
         if self.holding:
             self._ramp = BRAKE
-            stop_mm = move.left_mm - per_2a * move.entry_sq
+            stop_mm = move.left_mm - per_2a * move.entry_mm2_s2
             if stop_mm < 0:
-                self._exit_mm_s = math.sqrt(max(move.entry_sq - 2 * move.acceleration_mm_s2 * move.left_mm, 0.0))
+                self._exit_mm_s = math.sqrt(max(move.entry_mm2_s2 - 2 * move.acceleration_mm_s2 * move.left_mm, 0.0))
             else:
                 self._complete_mm, self._exit_mm_s = stop_mm, 0.0
             return
@@ -167,12 +175,12 @@ class Stepper:
         self._ramp = ACCELERATE
         self._accelerate_until_mm = move.left_mm
         nominal_sq = nominal * nominal
-        meet_mm = 0.5 * (move.left_mm + per_2a * (move.entry_sq - exit_sq))
-        if move.entry_sq > nominal_sq:
-            self._accelerate_until_mm = move.left_mm - per_2a * (move.entry_sq - nominal_sq)
+        meet_mm = 0.5 * (move.left_mm + per_2a * (move.entry_mm2_s2 - exit_sq))
+        if move.entry_mm2_s2 > nominal_sq:
+            self._accelerate_until_mm = move.left_mm - per_2a * (move.entry_mm2_s2 - nominal_sq)
             if self._accelerate_until_mm <= 0:
                 self._ramp = BRAKE
-                self._exit_mm_s = math.sqrt(max(move.entry_sq - 2 * move.acceleration_mm_s2 * move.left_mm, 0.0))
+                self._exit_mm_s = math.sqrt(max(move.entry_mm2_s2 - 2 * move.acceleration_mm_s2 * move.left_mm, 0.0))
                 self._brake_over = True
             else:
                 self._brake_after_mm = per_2a * (nominal_sq - exit_sq)
@@ -185,10 +193,10 @@ class Stepper:
             self._brake_after_mm = per_2a * (nominal_sq - exit_sq)
             if self._brake_after_mm < meet_mm:
                 self._top_mm_s = nominal
-                if move.entry_sq == nominal_sq:
+                if move.entry_mm2_s2 == nominal_sq:
                     self._ramp = CRUISE
                 else:
-                    self._accelerate_until_mm -= per_2a * (nominal_sq - move.entry_sq)
+                    self._accelerate_until_mm -= per_2a * (nominal_sq - move.entry_mm2_s2)
             else:
                 self._accelerate_until_mm = self._brake_after_mm = meet_mm
                 self._top_mm_s = math.sqrt(2 * move.acceleration_mm_s2 * meet_mm + exit_sq)
@@ -200,17 +208,17 @@ class Stepper:
         self._set_duty(move, stretch)
         exact = self._steps_per_mm * left_mm
         steps_left = math.ceil(exact - 1e-7)
-        events = math.ceil(self._steps_left - 1e-7) - steps_left
+        events = math.ceil(self._left_count - 1e-7) - steps_left
         if events == 0 and self.holding:
             self.ended = True
             return False
         duration_s += self._rest_s
-        moved = math.ceil(self._steps_left - 1e-7) - exact
+        moved = math.ceil(self._left_count - 1e-7) - exact
         per_step_s = duration_s / moved if moved > 0 else 0.0
         if events > 0:
-            self.segments.append(Segment(stretch, events, events * per_step_s, self._duty))
+            self.segments.append(Segment(stretch, events, events * per_step_s, self._duty_frac))
         self._rest_s = (steps_left - exact) * per_step_s
-        self._steps_left = float(steps_left)
+        self._left_count = float(steps_left)
         move.left_mm = left_mm
         if left_mm <= self._complete_mm + EPSILON_MM:
             if left_mm > EPSILON_MM:
@@ -283,12 +291,12 @@ class Stepper:
         if not (stretch.dynamic or self.update_pin):
             return
         if move.spindle in (3, 4):
-            speed = move.speed
+            speed = move.s_count
             if stretch.dynamic and move.feed_mm_s > 0:
                 speed *= self.speed_mm_s / move.feed_mm_s
-            self._duty = self.duty(speed)
+            self._duty_frac = self.duty(speed)
         else:
-            self._duty = self.duty(0.0)
+            self._duty_frac = self.duty(0.0)
         self.update_pin = False
 
     def start(self, now_s: float) -> None:

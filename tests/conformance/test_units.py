@@ -21,7 +21,7 @@ import simulators
 
 UNIT = re.compile(
     r"(_|^)(mm|mm2|mm3|m|px|mm_s|mm_s2|mm_min|mm_px|mm2_N|mm_N|N|mN|kN|N_s|N_mm|N_mm2|Nmm|N_m|MPa|kPa|s|ms|us|ns|Hz|hz|rad|deg|rad_s"
-    r"|C|degC|percent|mJ|kg|g|kg_m3|N_mm3|bytes|frac|ratio|count|baud|V|dB|lines_s|per_s|mm_C|cu|1_mm|per_mm)$"
+    r"|C|degC|percent|mJ|kg|g|kg_m3|N_mm3|bytes|frac|ratio|count|baud|V|dB|lines_s|per_s|mm_C|cu|1_mm|per_mm|mm2_s2)$"
 )
 # `cu` is a cloud unit: what a scan without a scale is measured in.
 # Mathematics keeps its letters where the formula is in view; an elastic modulus ends in its unit anyway.
