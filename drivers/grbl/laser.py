@@ -24,6 +24,7 @@ from drivers.transport import Transport
 WAKE_S = 4.0  # a board that restarts when its port is opened needs up to two seconds
 HOLD_S = 1.0
 BANNER_S = 2.0
+BANNER_OFF_S = 1.0  # a reset in motion speaks after half a second
 SETTLE_S = 0.15
 REPEAT_S = 0.2
 RESETS_COUNT = 3
@@ -226,7 +227,7 @@ class Laser:
             banner = None
             for _ in range(RESETS_COUNT):
                 self.link.send(RESET)
-                _, seen = self.link.wait_for(lambda m: isinstance(m, Banner), BANNER_S)
+                _, seen = self.link.wait_for(lambda m: isinstance(m, Banner), BANNER_OFF_S)
                 alarms += [m for m in seen if isinstance(m, Alarm)]
                 banner = next((m for m in seen if isinstance(m, Banner)), None)
                 if banner is not None:

@@ -192,12 +192,13 @@ def run_program(laser: Laser, lines: Sequence[str], watcher: Watcher) -> Progres
 
 
 def _await_standstill(run: _Run) -> None:
-    """The last answer says that the queue is empty; see it confirmed."""
-    end_s = run.link.clock.now_s() + END_S
-    while run.link.clock.now_s() < end_s:
-        run.unanswered_s = None
-        report = run.link.status()
-        if report is not None and report.state == "Idle":
-            run.watcher.seen(run.progress(), run.link.clock.now_s())
-            return
-    raise DeviceTimeout(WHO, "the end of the job by becoming idle", END_S)
+    """The last answer says that the queue is empty; see it confirmed, and listen for an answer too many."""
+    clock = run.link.clock
+    end_s, idle_s = clock.now_s() + END_S, math.inf
+    while clock.now_s() < min(end_s, idle_s + IDLE_PROOF_S):
+        run.step()
+        report = run.link.report
+        if report is not None and report.state == "Idle" and math.isinf(idle_s) and run.link.reported_s > run.changed_s:
+            idle_s = clock.now_s()
+    if math.isinf(idle_s):
+        raise DeviceTimeout(WHO, "the end of the job by becoming idle", END_S)

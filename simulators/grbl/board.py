@@ -17,6 +17,7 @@ from simulators.grbl.system import program
 
 BITS_PER_BYTE = 10  # 8N1
 RX_BYTES, TX_BYTES = 128, 104
+TICK_S = 1e-6  # shorter waits are none
 UART_BYTES = 2  # what the receiver's own registers hold while the program is deaf
 REAL_TIME = {0x3F: Asked.STATUS, 0x7E: Asked.START, 0x21: Asked.HOLD, 0x84: Asked.DOOR}
 RESET = 0x18
@@ -116,7 +117,11 @@ class Board:
     def _run(self) -> None:
         """Let the program go on until it waits; it stalls while its transmit buffer is full."""
         m = self.machine
-        if self._byte_s and self._out_free_s - m.now_s > TX_BYTES * self._byte_s and Asked.RESET not in m.asked:
+        if (
+            self._byte_s
+            and self._out_free_s - m.now_s > TX_BYTES * self._byte_s + TICK_S
+            and Asked.RESET not in m.asked
+        ):
             self._wake_s = self._out_free_s - TX_BYTES * self._byte_s
             return
         self._wake_s = next(self._program)
