@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -128,7 +129,7 @@ def slits(count: int, length_mm: float = 4.0, feed_mm_min: int = 1500) -> list[s
 def lit_while_standing(trace: Sequence[Point]) -> float:
     """Return the longest time in s that the beam was on while the machine stood still."""
     worst = 0.0
-    for a, b in zip(trace[:-1], trace[1:], strict=True):
+    for a, b in itertools.pairwise(trace):
         if a.power_frac > 0 and (a.x_mm, a.y_mm) == (b.x_mm, b.y_mm):
             worst = max(worst, b.t_s - a.t_s)
     return worst
