@@ -1,0 +1,28 @@
+"""`fabctl doctor`: what of this machine and bench works, and what to type where it does not."""
+
+from __future__ import annotations
+
+import click
+
+from fabctl.cli.common import json_option, lab, show
+from fabctl.errors import DEVICE
+
+
+@click.command("doctor")
+@click.option("--bench", "bench_name", help="Also look at this bench's devices (asks each who it is; nothing moves).")
+@json_option
+@click.pass_context
+def command(ctx: click.Context, bench_name: str | None, as_json: bool) -> None:
+    """Say what of this machine and bench works. Nothing moves and nothing is written."""
+    from fabctl.health import bench_checks, machine_checks
+
+    home = lab()
+    checks = machine_checks(home)
+    if bench_name is not None:
+        checks += bench_checks(home, bench_name)
+    mark = {True: "ok  ", False: "FAIL"}
+    lines = [f"{mark[c.works]} {c.what:28} {c.detail}" + (f"\n       {c.hint}" if c.hint else "") for c in checks]
+    good = all(c.works for c in checks)
+    show({"works": good, "checks": [c.as_dict() for c in checks]}, as_json, lines)
+    if not good:
+        ctx.exit(DEVICE)

@@ -1,0 +1,73 @@
+"""`fabctl flow`: design, cut, indent, scan and report one specimen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from fabctl.bench import deployment_checklist, refuse_without
+from fabctl.cli.common import bench_option, json_option, lab, progress, say, show, yes_option
+from fabctl.config.bench import load_bench
+from fabctl.errors import DONE, OUT_OF_TOLERANCE
+from fabctl.flow import Flow, Order, continued, runner, steps_after_deployment, steps_until_cut
+
+
+@click.command("flow")
+@click.argument("spec", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--target", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Another target surface.")
+@click.option("--continue", "specimen", metavar="SPECIMEN", help="Go on with a sheet that was cut and is deployed.")
+@click.option(
+    "--method", default="dome", show_default=True, help="How it is pressed: file, or name in configs/methods."
+)
+@click.option("--tolerance-frac", type=float, default=0.02, show_default=True, help="Of the target's diagonal.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Same seed, same scan and same answer.")
+@bench_option
+@yes_option
+@json_option
+def command(
+    spec: Path | None,
+    target: Path | None,
+    specimen: str | None,
+    method: str,
+    tolerance_frac: float,
+    seed: int,
+    bench_name: str,
+    yes: bool,
+    as_json: bool,
+) -> int:
+    """Take SPEC through every room: design, cut, indent, scan, report.
+
+    On a bench where a person deploys the sheet, flow stops after the cut with a checklist;
+    `--continue SPECIMEN` goes on.
+    """
+    if (spec is None) == (specimen is None):
+        raise click.UsageError("give either SPEC or --continue SPECIMEN")
+    home = lab()
+    bench = load_bench(bench_name, home.root)
+    refuse_without(bench, "laser", "rig", "scan")
+    order = Order(bench, bench_name, method, tolerance_frac, yes, seed)
+    run, emit = runner(home), progress()
+    if specimen is not None:
+        flow = continued(home, specimen)
+    else:
+        assert spec is not None
+        flow = steps_until_cut(home, order, spec, target, run, emit)
+        if bench.deployment == "by_hand":
+            return _wait_for_a_person(flow, order, as_json)
+    flow = steps_after_deployment(order, flow, run, emit)
+    report = flow.steps["report"]
+    data = {"specimen": flow.specimen, "design": flow.design, **flow.steps}
+    data |= {"verdict": report["verdict"], "sentence": report["sentence"], "report": report["report"]}
+    show(data, as_json, [f"{flow.specimen}: {report['sentence']}", f"report: {report['report']}"])
+    return OUT_OF_TOLERANCE if flow.out_of_tolerance else DONE
+
+
+def _wait_for_a_person(flow: Flow, order: Order, as_json: bool) -> int:
+    assert flow.specimen is not None
+    lines = deployment_checklist(order.bench, flow.specimen)
+    data = {"specimen": flow.specimen, "design": flow.design, **flow.steps, "next": list(lines)}
+    show(data, as_json, [f"{flow.specimen} is cut. Now by hand:", *lines])
+    if as_json:
+        say(f"{flow.specimen} is cut. By hand now: {lines[-1]}")
+    return DONE

@@ -1,0 +1,117 @@
+"""The force curve on a specimen's page: measured against what the design foresaw."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fabctl.indent.method import read_predicted
+from fabctl.records.folder import RunFolder, status_of
+from fabctl.reports.model import Fact, Figure, Step
+
+FIGURES = (
+    ("stiffness_secant_N_mm", "secant stiffness", "N/mm"),
+    ("stiffness_initial_N_mm", "initial stiffness", "N/mm"),
+    ("force_max_N", "largest force", "N"),
+    ("load_energy_mJ", "energy in", "mJ"),
+    ("unload_energy_mJ", "energy back", "mJ"),
+    ("hysteresis_ratio", "hysteresis", ""),
+    ("recovery_ratio", "recovery of shape", ""),
+)
+
+
+def indent_step(run: RunFolder, design: Path) -> Step:
+    """Return the part about one indentation run."""
+    manifest, result = run.manifest(), run.result() or {}
+    config = manifest.get("config", {})
+    method = config.get("method", {}).get("name", "?")
+    predicted = design / "response.csv"
+    curves = run.path / "artefacts" / "curves.csv"
+    figures = (plot(curves, predicted if predicted.is_file() else None),) if curves.is_file() else ()
+    summary = (
+        f"Method {method}, {result.get('curves_count', 0)} curves that count, {result.get('rows_count', 0)} samples."
+    )
+    outcome = run.outcome() or {}
+    notes = tuple(f"{f['level']}: {f['message']}" for f in result.get("findings", []))
+    if outcome.get("status") != "done" and outcome.get("message"):
+        notes = (str(outcome["message"]), *notes)
+    return Step("Indentation", status_of(run), summary, tuple(_facts(result, config)), figures, notes)
+
+
+def _facts(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[Fact]:
+    found = []
+    for key, label, unit in FIGURES:
+        value = result.get(key)
+        if value is None:
+            reason = result.get("not_found", {}).get(key)
+            found += [Fact(label, "not found", reason)] if reason else []
+            continue
+        spread = result.get(key.replace("_N_mm", "_ci95_N_mm")) if key.endswith("_N_mm") else None
+        found.append(Fact(label, f"{value:.4g} {unit}".strip(), f"± {spread:.2g} (95 %)" if spread else ""))
+    foreseen = result.get("predicted_secant_N_mm")
+    if foreseen is not None:
+        measured = result.get("stiffness_secant_N_mm")
+        note = f"measured / predicted = {measured / foreseen:.2f}" if measured and foreseen else ""
+        found.append(Fact("predicted secant stiffness", f"{foreseen:.4g} N/mm", note))
+    rig = config.get("rig", {})
+    found.append(
+        Fact("rig", f"{rig.get('model', '?')} no. {rig.get('serial', '?')}", f"at {config.get('sample_hz')} Hz")
+    )
+    calibration = config.get("calibration")
+    found.append(Fact("calibration", "none" if calibration is None else str(calibration.get("made_utc", "known"))))
+    for name, value in (config.get("conditions") or {}).items():
+        label, _, unit = str(name).rpartition("_")
+        found.append(Fact(label or str(name), f"{value:.4g} {unit}" if isinstance(value, float) else f"{value} {unit}"))
+    return found
+
+
+def plot(curves: Path, predicted: Path | None) -> Figure:
+    """Return all curves of a run with the predicted one behind them, as SVG in the page."""
+    from matplotlib.figure import Figure as Canvas
+
+    canvas = Canvas(figsize=(6.2, 3.9), layout="constrained")
+    axes = canvas.add_subplot()
+    deepest_mm = 0.0
+    for (_, branch), (depth, force) in _branches(curves).items():
+        axes.plot(
+            depth, force, color="#0b6e99", lw=1.0 if branch == "load" else 0.8, ls="-" if branch == "load" else "--"
+        )
+        deepest_mm = max(deepest_mm, *depth)
+    axes.plot([], [], color="#0b6e99", label="measured (dashed: unloading)")
+    if predicted is not None:
+        foreseen = read_predicted(predicted)
+        shown = foreseen.depth_mm <= deepest_mm * 1.05
+        axes.plot(
+            foreseen.depth_mm[shown], foreseen.load_N[shown], color="#c8502d", lw=1.6, alpha=0.8, label="predicted"
+        )
+    axes.set_xlabel("displacement from contact [mm]")
+    axes.set_ylabel("force [N]")
+    axes.axhline(0, color="#999999", lw=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    return Figure(as_svg(canvas), "Force against displacement; the frame's give and the tare are taken off.", True)
+
+
+def as_svg(canvas: Any, dpi: float = 100.0) -> str:
+    """Return a matplotlib figure as an `<svg>` element whose ids no other figure of the page shares."""
+    import matplotlib
+
+    stream = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "fabctl", "svg.fonttype": "path"}):
+        canvas.savefig(stream, format="svg", dpi=dpi, metadata={"Date": None, "Creator": None})
+    text = stream.getvalue()
+    return re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.S)
+
+
+def _branches(curves: Path) -> dict[tuple[str, str], tuple[list[float], list[float]]]:
+    found: dict[tuple[str, str], tuple[list[float], list[float]]] = {}
+    with curves.open(encoding="utf-8", newline="") as stream:
+        for row in csv.DictReader(stream):
+            depth, force = found.setdefault((f"{row['point']}.{row['curve']}", row["branch"]), ([], []))
+            depth.append(float(row["depth_mm"]))
+            force.append(float(row["force_N"]))
+    return found
