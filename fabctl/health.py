@@ -98,7 +98,6 @@ def _folder(lab: Workspace) -> Check:
 
 def _library() -> Check:
     from design.cells.library import load_library
-
     from design.errors import DesignError
 
     try:

@@ -115,7 +115,7 @@ def _histogram(value_mm: np.ndarray[Any, Any], span_mm: float) -> str:
     canvas = Canvas(figsize=(4.4, 3.0), layout="constrained")
     axes = canvas.add_subplot()
     known = value_mm[np.isfinite(value_mm)]
-    axes.hist(known, bins=np.linspace(-span_mm, span_mm, 61), color="#5b6875")
+    axes.hist(known, bins=np.linspace(-span_mm, span_mm, 61).tolist(), color="#5b6875")
     axes.axvline(0, color="#16202a", lw=0.8)
     axes.axvline(float(known.mean()), color="#b2182b", lw=1.0, ls="--", label=f"mean {known.mean():+.3f} mm")
     axes.set_xlabel("deviation [mm]")

@@ -103,4 +103,4 @@ def _unknown(mesh: TriMesh, faces: NDArray[np.int64]) -> dict[str, Any]:
 
 def _packed(values: NDArray[Any]) -> dict[str, str]:
     kind = "i4" if values.dtype.kind == "i" else "f4"
-    return {"dtype": kind, "bdata": base64.b64encode(np.ascontiguousarray(values, dtype=f"<{kind}")).decode()}
+    return {"dtype": kind, "bdata": base64.b64encode(values.astype(f"<{kind}").tobytes()).decode()}

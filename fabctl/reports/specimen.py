@@ -1,0 +1,105 @@
+"""Everything known of one specimen as one page: verdict first, then each room, then where it all came from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from fabctl.records.folder import RunFolder, sha256, status_of
+from fabctl.reports.design_step import cut_step, design_step
+from fabctl.reports.indent_step import indent_step
+from fabctl.reports.model import Fact, Provenance, Report, Step, Word
+from fabctl.reports.scan_step import scan_step
+from fabctl.reports.view3d import script
+from fabctl.workspace import Specimen, Workspace
+
+
+def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
+    """Return the page about `specimen` from its records; what was not done is named as missing."""
+    runs = lab.runs_of(specimen.name)
+    latest = {str(run.manifest()["kind"]): run for run in runs if status_of(run) != "running"}
+    steps = [design_step(specimen.design)]
+    steps += [cut_step(latest["cut"])] if "cut" in latest else []
+    steps += [indent_step(latest["indent"], specimen.design)] if "indent" in latest else []
+    steps += [scan_step(latest["scan"])] if "scan" in latest else []
+    word, sentence, reasons = verdict(latest)
+    record = specimen.record()
+    name = _design_name(specimen)
+    return Report(
+        title=f"Specimen {specimen.name} · {name}",
+        subtitle=f"Made {str(record['made_utc'])[:16].replace('T', ' ')} UTC",
+        word=word,
+        sentence=sentence,
+        reasons=tuple(reasons),
+        key_facts=tuple(_keys(steps, latest)),
+        steps=tuple(steps),
+        provenance=tuple(_provenance(specimen, runs)),
+        versions=tuple(_versions(runs)),
+        made_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        head=script() if "scan" in latest else "",
+    )
+
+
+def verdict(latest: dict[str, RunFolder]) -> tuple[Word, str, list[str]]:
+    """Return pass, fail or incomplete, one sentence, and the reasons against a pass."""
+    missing = [kind for kind in ("cut", "indent", "scan") if kind not in latest]
+    broken = [
+        f"{kind}: {status_of(run)}: {(run.outcome() or {}).get('message', 'nothing says how it ended')}"
+        for kind, run in latest.items()
+        if kind in ("cut", "indent", "scan") and status_of(run) != "done"
+    ]
+    scan = (latest["scan"].result() or {}) if "scan" in latest else {}
+    deviation = scan.get("deviation")
+    if missing or broken or deviation is None:
+        reasons = [f"{kind}: not done yet" for kind in missing] + broken
+        return "incomplete", "Not every step has a result.", reasons
+    size = f"RMS deviation {deviation['rms_mm']:.2f} mm, {deviation['rms_frac']:.2%} of the diagonal"
+    tolerance = scan.get("tolerance_frac")
+    if tolerance is None:
+        return "incomplete", f"{size}; no tolerance was given to hold it against.", []
+    share = f"{scan['share_within_required_frac']:.0%} of the area must lie within {tolerance:.2%}"
+    if scan.get("verdict") == "pass":
+        return "pass", f"{size}; within tolerance.", [share]
+    if scan.get("verdict") == "fail":
+        return "fail", f"{size}; out of tolerance.", [share]
+    return "incomplete", f"{size}; the scan leaves the verdict open.", [f["message"] for f in scan.get("findings", [])]
+
+
+def _keys(steps: Sequence[Step], latest: dict[str, RunFolder]) -> Iterator[Fact]:
+    facts = {(step.title, fact.label): fact for step in steps for fact in step.facts}
+    wanted = (
+        ("Scan against target", "RMS deviation"),
+        ("Scan against target", "95 % of the area within"),
+        ("Indentation", "secant stiffness"),
+        ("Indentation", "largest force"),
+        ("Design", "cells"),
+    )
+    yield from (facts[key] for key in wanted if key in facts)
+
+
+def _provenance(specimen: Specimen, runs: Sequence[RunFolder]) -> Iterator[Provenance]:
+    when = str(specimen.record()["made_utc"])[:16]
+    for path in sorted(p for p in specimen.design.iterdir() if p.is_file()):
+        yield Provenance("design", path.name, when, sha256(path), "")
+    for run in runs:
+        manifest = run.manifest()
+        began = str(manifest["started_utc"])[:16]
+        kind, detail = str(manifest["kind"]), f"{status_of(run)}, {manifest['operator']}"
+        yield Provenance(kind, run.run_id, began, sha256(run.path / "manifest.json"), detail)
+        outside = [item for item in manifest["inputs"] if Path(item["path"]).parent != specimen.design]
+        for item in outside:
+            yield Provenance("input", Path(item["path"]).name, began, str(item["sha256"]), "")
+
+
+def _versions(runs: Sequence[RunFolder]) -> Iterator[Fact]:
+    found: dict[str, Any] = runs[-1].manifest()["versions"] if runs else {}
+    yield from (Fact(name, str(value)) for name, value in found.items())
+
+
+def _design_name(specimen: Specimen) -> str:
+    manifest = specimen.design / "manifest.json"
+    found = json.loads(manifest.read_text(encoding="utf-8")) if manifest.is_file() else {}
+    return str(found.get("name") or Path(str(specimen.record()["design"])).name)
