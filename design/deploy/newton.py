@@ -140,9 +140,24 @@ class System:
 
 
 def factorise(matrix: sp.csc_matrix) -> tuple[SuperLU, int]:
-    """Return the factorisation and the number of negative pivots (= negative eigenvalues, by Sylvester's law)."""
+    """Return the factorisation and the number of negative pivots (= negative eigenvalues, by Sylvester's law).
+
+    Raises `RuntimeError` where a pivot is exactly zero.
+    """
     lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return lu, int(np.sum(lu.U.diagonal() < 0))
+
+
+def _convex(system: System, matrix: sp.csc_matrix, shift: float, first_shift: float) -> tuple[SuperLU, float]:
+    """Return the factorisation of the matrix shifted as little as makes it positive, and that shift."""
+    while True:
+        try:
+            lu, negative = factorise(system.shifted(matrix, shift) if shift else matrix)
+        except RuntimeError:  # a zero pivot: a soft direction, such as a sheet that slides on a floor
+            negative = 1
+        if negative == 0:
+            return lu, shift
+        shift = max(4 * shift, first_shift)
 
 
 def pins(x_mm: Reals) -> NDArray[np.bool_]:
@@ -198,10 +213,7 @@ def solve(
             continue
         if iteration == iterations_max:
             break
-        lu, negative = factorise(system.shifted(matrix, shift) if shift else matrix)
-        while negative:
-            shift = max(4 * shift, first_shift)
-            lu, negative = factorise(system.shifted(matrix, shift))
+        lu, shift = _convex(system, matrix, shift, first_shift)
         step = -lu.solve(gradient.ravel()).reshape(x.shape)
         step[hold] = 0.0
         step *= min(1.0, longest / max(float(np.linalg.norm(step, axis=1).max()), 1e-300))
