@@ -55,15 +55,20 @@ def hole_vertices(filled: TriMesh, count: int) -> Indices:
     return np.unique(fans)
 
 
-def rim_u(surface: Disk, options: FlattenOptions, modes_count: int) -> Values:
+def rim_u(surface: Disk, options: FlattenOptions) -> Values:
     """Return the rim's scale factors as the options ask: none, given ones, or those of least spread."""
     if options.boundary == "isometric":
         return np.zeros(len(surface.rim))
     if options.boundary == "optimised":
-        return best_rim(surface, modes_count)[0]
+        return best_rim(surface, options.modes_count)[0]
+    return given_u(options)[surface.rim]
+
+
+def given_u(options: FlattenOptions) -> Values:
+    """Return the prescribed scale factors; raises where there are none."""
     if options.boundary_u is None:
         raise FlattenError("a prescribed boundary needs `boundary_u`, one value per vertex of the mesh")
-    return np.asarray(options.boundary_u[surface.rim], dtype=np.float64)
+    return np.asarray(options.boundary_u, dtype=np.float64)
 
 
 def best_rim(surface: Disk, modes_count: int) -> tuple[Values, Spread]:

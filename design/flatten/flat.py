@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from design.errors import FlattenError
+from design.errors import FlattenError, NotConverged
 from design.findings import Finding, errors
 from design.flatten.cones import place_cones, seams_of
 from design.flatten.cut import Cut, cut_along
 from design.flatten.disk import disk, lay_out, rim_u
 from design.flatten.quality import check_flat, signed_areas_mm2
 from design.flatten.result import Flattening, FlattenOptions, Seam
+from design.flatten.rims import lay_rims, rims, rims_u
 from design.flatten.tube import lay_strip, tube, tube_scale_factors
 from design.surface import Faces, Indices, Points, TriMesh, boundary_loops
 
@@ -25,24 +26,39 @@ TUBE_ABOVE_ratio = 2.0  # a spread beyond any library: rather a seam than a fill
 def flatten(mesh: TriMesh, options: FlattenOptions = DEFAULTS) -> Flattening:
     """Return the surface laid flat, as conformally as its mesh allows; the flat's scale is the rim's own.
 
-    `mesh` must be one oriented manifold piece with a boundary (`read_mesh` sees to that); holes are closed for the
-    computation and open again afterwards. Raises `FlattenError` with all findings where the flat has flipped faces or
-    overlaps itself, whatever is tried: fewer boundary modes, then a Laplacian of better shaped triangles.
+    `mesh` must be one oriented manifold piece with a boundary (`read_mesh` sees to that); holes are open again in the
+    flat. Raises `FlattenError` with all findings where the flat has flipped faces or overlaps itself, whatever is
+    tried: fewer boundary modes, filled holes, a Laplacian of better shaped triangles.
     """
     loops = boundary_loops(mesh)
     if not loops:
         raise FlattenError("the surface is closed; a sheet has an edge")
-    tries = [options]
-    if options.boundary == "optimised":
-        tries += [replace(options, modes_count=count) for count in (8, 4, 2) if count < options.modes_count]
-    tries += [replace(tries[-1], laplacian="delaunay")]
+    if options.boundary == "prescribed" and options.boundary_u is None:
+        raise FlattenError("a prescribed boundary needs `boundary_u`, one value per vertex of the mesh")
     faults: list[Finding] = []
-    for asked in tries:
-        flat = _flatten_as_asked(mesh, loops, asked)
-        if not errors(flat.findings):
-            return replace(flat, findings=(*flat.findings, *_changed(options, asked)))
-        faults = faults or list(flat.findings)
+    for asked in _tries(options, len(loops)):
+        try:
+            flat = _flatten_as_asked(mesh, loops, asked)
+        except NotConverged as fault:
+            found = [Finding("FLAT-PROGRAMME", str(fault))]
+        except FlattenError as fault:
+            found = list(fault.findings) or [Finding("FLAT-RIM", fault.message)]
+        else:
+            if not errors(flat.findings):
+                return replace(flat, findings=(*flat.findings, *_changed(options, asked)))
+            found = list(flat.findings)
+        faults = faults or found
     raise FlattenError("the surface could not be laid flat", faults)
+
+
+def _tries(options: FlattenOptions, loop_count: int) -> list[FlattenOptions]:
+    """Return what is asked, then ever tamer ways to come near it."""
+    tries = [options]
+    if options.boundary == "optimised" or options.cones_count:
+        tries += [replace(options, modes_count=count) for count in (8, 4, 2) if count < options.modes_count]
+    if loop_count > 1 and options.holes != "filled":
+        tries.append(replace(tries[-1], holes="filled"))
+    return [*tries, replace(tries[-1], laplacian="delaunay")]
 
 
 def _changed(options: FlattenOptions, used: FlattenOptions) -> list[Finding]:
@@ -50,6 +66,8 @@ def _changed(options: FlattenOptions, used: FlattenOptions) -> list[Finding]:
     if used.modes_count != options.modes_count:
         text = f"the boundary was optimised with {used.modes_count} modes only; with more the flat overlapped itself"
         found.append(Finding("FLAT-MODES", text, "info"))
+    if used.holes != options.holes:
+        found.append(Finding("FLAT-FILLED", "holes were filled: with rims of their own the flat overlapped", "info"))
     if used.laplacian != options.laplacian:
         found.append(Finding("FLAT-DELAUNAY", "badly shaped faces: the intrinsic Laplacian was used", "info"))
     return found
@@ -78,11 +96,17 @@ def _joins(loops: list[Indices], path: Indices) -> bool:
 
 
 def _flatten_disk(mesh: TriMesh, loops: list[Indices], options: FlattenOptions) -> Flattening:
-    surface = disk(mesh, loops, options.laplacian)
-    u = surface.scale_factors(rim_u(surface, options, options.modes_count))
-    flat_mm = lay_out(surface, u)[: surface.count]
+    count = len(mesh.vertices_mm)
+    if len(loops) > 1 and (options.holes == "free" or (options.holes == "auto" and options.boundary == "optimised")):
+        open_surface = rims(mesh, loops, options.laplacian)
+        u = rims_u(open_surface, options)
+        flat_mm = lay_rims(open_surface, u)
+    else:
+        surface = disk(mesh, loops, options.laplacian)
+        u = surface.scale_factors(rim_u(surface, options))
+        flat_mm, u = lay_out(surface, u)[:count], u[:count]
     found = check_flat(mesh, flat_mm, mesh.faces, loops)
-    return _finish(mesh, flat_mm, mesh.faces, np.arange(surface.count), u[: surface.count], (), found)
+    return _finish(mesh, flat_mm, mesh.faces, np.arange(count), u, (), found)
 
 
 def _flatten_tube(mesh: TriMesh, loops: list[Indices], options: FlattenOptions) -> Flattening:
@@ -118,7 +142,7 @@ def _flatten_cut(mesh: TriMesh, opened: Cut, options: FlattenOptions) -> Flatten
     index = opened.target_index
     surface = disk(opened.mesh, loops, options.laplacian)
     given = None if options.boundary_u is None else options.boundary_u[index]
-    u = surface.scale_factors(rim_u(surface, replace(options, boundary_u=given), options.modes_count))
+    u = surface.scale_factors(rim_u(surface, replace(options, boundary_u=given)))
     flat_mm = lay_out(surface, u, _twins(surface.rim, opened))[: surface.count]
     seams = tuple(_measured(Seam(left, right, 0.0, (0.0, 0.0), 0.0), flat_mm) for right, left in opened.sides)
     found = check_flat(opened.mesh, flat_mm, opened.mesh.faces, loops)

@@ -14,6 +14,7 @@ from design.surface import Faces, Indices, Points, TriMesh
 
 Boundary = Literal["isometric", "prescribed", "optimised"]
 Laplacian = Literal["cotangent", "delaunay"]
+HoleChoice = Literal["auto", "filled", "free"]
 SeamChoice = Literal["auto", "tube", "none"]
 
 
@@ -22,16 +23,23 @@ class FlattenOptions:
     """How the surface is to be laid flat.
 
     `boundary`: `isometric` keeps the rim's length (u = 0, the published way), `prescribed` takes `boundary_u`,
-    `optimised` chooses the rim so that the spread of expansions is least. `seam`: a surface with two ends is laid flat
-    as a strip with one seam (`tube`), or with its smaller end filled as a hole (`none`); `auto` takes the seam where a
-    filled hole would ask for more than any library has. `cut_path` is a chain of vertices to cut along: the seam of a
-    tube, or a dart from the rim inwards. `cones_count` cones are placed where they help most, the rim optimised with
-    them.
+    `optimised` chooses the rim so that the spread of expansions is least.
+
+    `holes`: `filled` closes them by a fan for the computation (the published way), `free` gives their rims scale
+    factors of their own; `auto` frees them where the boundary is optimised.
+
+    `seam`: a surface with two ends is laid flat as a strip with one seam (`tube`), or with its smaller end as a hole
+    (`none`); `auto` takes the seam where a hole would ask for more than any library has.
+
+    `cut_path` is a chain of vertices to cut along: the seam of a tube, or a dart from the rim inwards.
+
+    `cones_count` cones are placed where they help most, the rim optimised with them.
     """
 
     boundary: Boundary = "isometric"
     boundary_u: NDArray[np.float64] | None = None  # (n,) over the mesh's vertices, read on the boundary only
     modes_count: int = 24  # waves along the rim that an optimised boundary may use
+    holes: HoleChoice = "auto"
     seam: SeamChoice = "auto"
     cut_path: Indices | None = None
     cones_count: int = 0

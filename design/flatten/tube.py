@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from design.errors import FlattenError
 from design.flatten.curve import close, edge_lengths_mm, tangents, trace
 from design.flatten.cut import Cut, cut_along, shortest_chain
-from design.flatten.disk import fill_holes, hole_vertices
+from design.flatten.disk import fill_holes, given_u, hole_vertices
 from design.flatten.laplace import Laplace, angle_defects, assemble, factored
 from design.flatten.programme import least_spread, rim_modes, wave_numbers
 from design.flatten.result import FlattenOptions, Laplacian
@@ -75,9 +74,7 @@ def tube_scale_factors(surface: Tube, options: FlattenOptions) -> Values:
     on_second = np.concatenate([np.zeros(len(first)), np.ones(len(second))])
     given = np.zeros(len(border))
     if options.boundary == "prescribed":
-        if options.boundary_u is None:
-            raise FlattenError("a prescribed boundary needs `boundary_u`, one value per vertex of the mesh")
-        given = np.asarray(options.boundary_u[border], dtype=np.float64)
+        given = given_u(options)[border]
     base = surface.operator.extend(given, -surface.curvature)
     columns = [on_second]
     if options.boundary == "optimised":

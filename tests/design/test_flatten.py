@@ -15,7 +15,7 @@ from design.errors import FlattenError
 from design.flatten import FlattenOptions, flatten
 from design.flatten.quality import crossings, distortion, signed_areas_mm2
 from design.meshfiles import read_corner_uv, read_mesh
-from design.surface import TriMesh, boundary_loops
+from design.surface import TriMesh, boundary_loops, tidy
 from design.targets import TARGETS, cap, freeform, pierced_cap, saddle
 
 PUBLISHED = ["double_dome", "lilium_tower", "vase"]
@@ -146,3 +146,45 @@ def test_an_overlapping_flat_is_refused() -> None:
     with pytest.raises(FlattenError) as caught:
         flatten(long_spiral())
     assert {finding.code for finding in caught.value.findings} >= {"FLAT-OVERLAP"}
+
+
+def holed(mesh: TriMesh, centre_mm: tuple[float, float], radius_mm: float) -> TriMesh:
+    middle_mm = mesh.vertices_mm[mesh.faces].mean(axis=1)[:, :2]
+    return tidy(TriMesh(mesh.vertices_mm, mesh.faces[np.linalg.norm(middle_mm - centre_mm, axis=1) > radius_mm]))[0]
+
+
+def test_a_plane_with_holes_stays_as_it_is_when_its_rims_are_free() -> None:
+    mesh = holed(holed(saddle(height_mm=0), (20, 10), 15), (-35, -5), 9)
+    flat = flatten(mesh, FlattenOptions("prescribed", np.zeros(len(mesh.vertices_mm)), holes="free"))
+    assert similarity_residual_ratio(flat.flat_mm, mesh.vertices_mm[:, :2]) < 1e-9
+
+
+def test_free_rims_distort_less_than_a_large_filled_hole() -> None:
+    mesh = holed(cap(edge_mm=4), (10, 0), 40)
+    filled, free = (flatten(mesh, FlattenOptions(holes=holes)) for holes in ("filled", "free"))  # type: ignore[arg-type]
+    worst = [distortion(mesh, flat.flat_mm, flat.faces).max_ratio for flat in (filled, free)]
+    assert worst[0] > 1.5
+    assert worst[1] < 1.05
+
+
+@pytest.mark.parametrize("place_mm", [(10, 0), (30, -20)])
+def test_free_rims_spread_less_and_still_close(place_mm: tuple[float, float]) -> None:
+    mesh = holed(freeform(edge_mm=4), place_mm, 18)
+    filled = flatten(mesh, FlattenOptions("optimised", holes="filled"))
+    free = flatten(mesh, FlattenOptions("optimised"))
+    assert free.findings == ()
+    assert free.spread_ratio() < 0.99 * filled.spread_ratio()
+    assert distortion(mesh, free.flat_mm, free.faces).mean_ratio < 1.02
+    promised = np.exp(-free.u[free.faces].mean(axis=1))
+    assert np.abs(free.expansion_ratio / promised - 1).max() < 0.02
+
+
+def test_prescribed_rims_of_holes_get_the_lengths_asked_for() -> None:
+    mesh = pierced_cap(edge_mm=5)
+    start = flatten(mesh, FlattenOptions(holes="free"))
+    hole = boundary_loops(mesh)[1]
+    again = flatten(mesh, FlattenOptions("prescribed", start.u, holes="free"))
+    assert similarity_residual_ratio(again.flat_mm, start.flat_mm) < 1e-9
+    lengths = [np.linalg.norm(np.diff(v[hole], axis=0), axis=1) for v in (again.flat_mm, mesh.vertices_mm)]
+    asked = np.exp(0.5 * (start.u[hole[1:]] + start.u[hole[:-1]]))
+    np.testing.assert_allclose(lengths[0] / lengths[1], asked, rtol=0.02)
