@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import getpass
 import hashlib
 import json
 import os
@@ -22,7 +21,7 @@ from typing import Any
 
 from fabctl.config.bench import BenchConfig
 from fabctl.errors import BenchBusy, RefusedError, UsageError
-from fabctl.records.folder import write_atomically
+from fabctl.records.folder import person, write_atomically
 from fabctl.workspace import Workspace
 
 READY = "ready:"
@@ -99,7 +98,7 @@ def open_bench(lab: Workspace, config: BenchConfig, purpose: str) -> Iterator[Be
             raise BenchBusy(f"bench {config.name} is in use by {holder}; wait, or stop that job first") from None
         since = datetime.now(UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
         os.ftruncate(handle, 0)
-        os.pwrite(handle, f"{_person()} (process {os.getpid()}): {purpose}, since {since}".encode(), 0)
+        os.pwrite(handle, f"{person()} (process {os.getpid()}): {purpose}, since {since}".encode(), 0)
         yield Bench(config, state)
     finally:
         os.close(handle)
@@ -115,13 +114,6 @@ def _lock_path(config: BenchConfig, state: Path) -> Path:
     with contextlib.suppress(PermissionError):  # somebody else made it, for all
         folder.chmod(0o1777)
     return folder / f"{config.name}-{key}.lock"
-
-
-def _person() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):
-        return f"user {os.getuid()}"
 
 
 def deployment_checklist(config: BenchConfig, specimen: str) -> tuple[str, ...]:

@@ -56,16 +56,16 @@ def confirm(question: str, yes: bool) -> bool:
 def progress() -> Emit:
     """Return a listener that shows a job's events on stderr: a live line on a terminal, plain lines elsewhere."""
     live = sys.stderr.isatty()
-    last = [""]
+    tenth = [-1]
 
     def listen(event: Event) -> None:
         if event.kind == "progress" and event.done_frac is not None:
             text = f"{event.done_frac:6.1%}  {event.message}"
             if live:
                 click.echo(f"\r\x1b[2K{text}", err=True, nl=False)
-            elif text[:4] != last[0]:
+            elif int(event.done_frac * 10) != tenth[0]:
                 click.echo(text, err=True)
-            last[0] = text[:4]
+            tenth[0] = int(event.done_frac * 10)
         elif event.kind in ("stage", "state", "warning", "finding"):
             lead = "\r\x1b[2K" if live else ""
             click.echo(f"{lead}{event.message}", err=True)

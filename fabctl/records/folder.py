@@ -6,6 +6,7 @@ interrupted, and is still readable.
 
 from __future__ import annotations
 
+import getpass
 import hashlib
 import json
 import os
@@ -187,7 +188,7 @@ def start_run(
         "specimen": specimen,
         "started_utc": _utc().isoformat(),
         "process": os.getpid(),
-        "operator": operator or os.environ.get("USER") or "unknown",
+        "operator": operator or person(),
         "inputs": [{"path": str(p), "sha256": sha256(p), "bytes": p.stat().st_size} for p in inputs],
         "config": dict(config or {}),
         "seed": seed,
@@ -236,6 +237,14 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise RecordError(f"{path}: not a record")
     return found
+
+
+def person() -> str:
+    """Return the name of whoever runs this, as the system knows it."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return f"user {os.getuid()}"
 
 
 def _utc() -> datetime:

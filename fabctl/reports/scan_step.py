@@ -42,7 +42,8 @@ def _facts(result: Mapping[str, Any]) -> list[Fact]:
         found.append(Fact("points compared", f"{deviation['points_count']}", f"left out: {out}"))
     target = result.get("target", {})
     if target:
-        found.append(Fact("target's diagonal", f"{target['diagonal_mm']:.2f} mm", f"symmetry: {target['symmetries']}"))
+        own = ", ".join(map(str, target["symmetries"])) or "none"
+        found.append(Fact("target's diagonal", f"{target['diagonal_mm']:.2f} mm", f"its own symmetries: {own}"))
     pose = result.get("pose")
     if pose:
         found.append(Fact("scale", f"{pose['unit_mm']:.6g} mm a unit"))
