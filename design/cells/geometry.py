@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 SQRT3 = math.sqrt(3.0)
 THIRD_TURN = np.array([[-0.5, -SQRT3 / 2], [SQRT3 / 2, -0.5]])  # rotation by 120°
 EDGE_DIRECTION = np.array([0.5, SQRT3 / 2])  # of V0V2
-MOUTH_SHARE = 0.4  # of the hinge: room kept between the inner triangle's mouth and the end of slit 2
+MOUTH_SHARE = 0.4  # of the hinge: slit 2 must reach this far past the tip of slit 1 to form a hinge
 TOUCH_RATIO = 1e-4  # of the edge: closer than this, two borders of the cell count as touching
 
 
@@ -51,6 +51,7 @@ class Sector:
     cut: Array  # halfway along the inner triangle's side
     tip_inner: Array  # end of slit 1 on its inner line
     tip_outer: Array  # end of slit 1 on its outer line
+    blunt: bool  # the slits end before they face one another: no hinge, and the cut runs from the centre to the tip
 
     def outline_mm(self) -> Array:
         """Return the closed border, counter-clockwise, (10, 2)."""
@@ -77,14 +78,19 @@ def sector(t_mm: float, theta_rad: float, sheet: Sheet, hinge_mm: float | None =
         return np.asarray(start + (to_line - hinge / math.sin(math.pi / 3)) * along)
 
     tip_outer, tip_inner = tip(t_mm), tip(t_mm + slit)
-    # The mouths end on slit 2's inner line, opposite the tip; sooner where slit 2 or the arm ends before that.
     length = float(np.linalg.norm(tip_inner - (t_mm + slit) * EDGE_DIRECTION))
     opposite_inner, opposite_outer = float((tip_inner - bottom) @ along_2), float((tip_outer - bottom) @ along_2)
-    reach_inner = min(opposite_inner, length - MOUTH_SHARE * hinge)
-    # The arm's mouth slants away from the hinge, so that the arm is convex at the tip.
-    reach_arm = opposite_outer - min(hinge, 0.5 * opposite_outer)
+    # The mouths end on slit 2's inner line: the inner triangle's opposite the tip of slit 1, if slit 2 reaches so far.
+    blunt = opposite_inner > length - MOUTH_SHARE * hinge
+    reach_inner = length if blunt else opposite_inner
     reach_cut = 0.5 * (reach_inner + length)
-    cut = (t_mm + slit) * EDGE_DIRECTION + reach_cut * along
+    # The arm's mouth slants away from the hinge and downwards, so that the arm is convex at the tip.
+    reach_arm = opposite_outer - min(hinge, 0.5 * opposite_outer)
+    if tip_outer[1] < hinge:
+        reach_arm = min(reach_arm, 0.75 * float(tip_outer[1] / along_2[1]))
+    if blunt:
+        reach_arm = min(reach_arm, length - hinge)
+    cut = tip_inner if blunt else (t_mm + slit) * EDGE_DIRECTION + reach_cut * along
     return Sector(
         left=t_mm * EDGE_DIRECTION,
         corner=np.zeros(2),
@@ -96,6 +102,7 @@ def sector(t_mm: float, theta_rad: float, sheet: Sheet, hinge_mm: float | None =
         cut=cut,
         tip_inner=tip_inner,
         tip_outer=tip_outer,
+        blunt=blunt,
     )
 
 
@@ -140,7 +147,7 @@ def fault(t_mm: float, theta_rad: float, sheet: Sheet, hinge_mm: float | None = 
     along_2 = THIRD_TURN @ along
     if t_mm < margin or part.bottom[0] < margin:
         return "a slit starts at or beyond a corner of the unit"
-    if min(float((part.tip_outer - part.left) @ along), float((part.tip_inner - part.cut) @ along)) < margin:
+    if float((part.tip_outer - part.left) @ along) < margin:
         return "the hinge leaves no slit"
     if float((part.foot_arm - part.bottom) @ along_2) < margin or part.tip_outer[1] < margin:
         return "the slit's tip touches or crosses the mirror edge"
@@ -163,5 +170,6 @@ def self_crossing(ring_mm: Array) -> bool:
         )
 
     p, q, r, s = a[:, None], b[:, None], a[None, :], b[None, :]
-    crosses = (side(p, q, r) * side(p, q, s) < 0) & (side(r, s, p) * side(r, s, q) < 0)
+    rounding = 1e-12 * float(np.abs(ring_mm).max()) ** 4  # corners may coincide
+    crosses = (side(p, q, r) * side(p, q, s) < -rounding) & (side(r, s, p) * side(r, s, q) < -rounding)
     return bool(crosses.any())

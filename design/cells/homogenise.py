@@ -25,10 +25,11 @@ Array = NDArray[np.float64]
 Verdict = Literal["bistable", "not bistable", "invalid", "not converged"]
 
 SECTORS = 18  # in a hexagonal cell
+LEAST_WELL_RATIO = 0.003  # barrier over stored energy; halving the mesh moves it by 0.02 to 0.05 near the fold
 STEP_RATIO = 0.02  # of the stretch between two equilibria on the path
 SMALLEST_STEP_RATIO = 0.02 / 64
 BEYOND_RATIO = 0.12  # how far past the linkage's own expansion the path is followed
-LEAST_REACH_RATIO = 1.25  # the path goes at least this far; the published map ends at 1.129
+LEAST_REACH_RATIO = 1.2  # the path goes at least this far; second states begin at 1.12
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,7 @@ def solve_cell(t_mm: float, theta_rad: float, sheet: Sheet, density: Density = R
     found = solve_pair(t_mm, theta_rad, sheet, density)
     if isinstance(found, Failure):
         return Cell(t_mm, theta_rad, found.verdict, found.reason, found.residual_ratio)
-    return numbers(t_mm, theta_rad, found[0], found[1], density)
+    return numbers(t_mm, theta_rad, found[0], found[1])
 
 
 def solve_pair(
@@ -92,10 +93,14 @@ def solve_pair(
     return found if isinstance(found, Failure) else (m, found)
 
 
-def numbers(t_mm: float, theta_rad: float, m: Model, pair: Pair, density: Density) -> Cell:
+def numbers(t_mm: float, theta_rad: float, m: Model, pair: Pair) -> Cell:
     """Return the cell's figures from its two states."""
     saddle, stable = pair.saddle, pair.stable
-    linear = moduli(m, m.nodes(stable.y, stable.s_ratio), density)
+    well = (saddle.energy_mm2 - stable.energy_mm2) / stable.energy_mm2
+    if well < LEAST_WELL_RATIO:
+        reason = f"the barrier is less than {LEAST_WELL_RATIO:.1%} of the energy stored: too near the fold for the mesh"
+        return Cell(t_mm, theta_rad, "not bistable", reason, stable.residual_ratio)
+    linear = moduli(m, m.nodes(stable.y, stable.s_ratio))
     return Cell(
         t_mm,
         theta_rad,

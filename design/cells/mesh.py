@@ -50,6 +50,14 @@ class Density:
 REFERENCE = Density()
 
 
+def fitting(part: Sector, density: Density) -> Density:
+    """Return `density`, or its likeness for a sector without an inner triangle."""
+    if not part.blunt:
+        return density
+    mouth = 4 * density.rows // REFERENCE.rows
+    return Density((mouth,), density.along, mouth + density.rows, density.columns, density.first_mm)
+
+
 @dataclass(frozen=True, slots=True)
 class Topology:
     """What all sectors of one density share. P2: vertices first, then the midpoints of `edges`."""
@@ -168,6 +176,10 @@ def _inner_layers(part: Sector, density: Density) -> list[Array]:
     """Return the layers of the inner triangle's third, from its mouth to the centre, on straight rays."""
     layers = []
     steps = len(density.inner) - 1
+    if steps == 0:
+        at, knots = [0, 0.5, 1], np.array([part.cut, part.centre, part.cut_turned])
+        q = np.linspace(0.0, 1.0, density.inner[0] + 1)
+        return [np.column_stack([np.interp(q, at, knots[:, i]) for i in (0, 1)])]
     for k, count in enumerate(density.inner):
         q = np.linspace(0.0, 1.0, count + 1)
         near = _between(part.tip_inner, part.foot_inner, q)

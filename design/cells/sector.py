@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from design.cells import kernels
 from design.cells.elements import THREE_POINTS, gradients
 from design.cells.geometry import EDGE_DIRECTION, THIRD_TURN, centroid_mm, sector
-from design.cells.mesh import REFERENCE, Density, Topology, nodes_mm, topology, vertices_mm
+from design.cells.mesh import REFERENCE, Density, Topology, fitting, nodes_mm, topology, vertices_mm
 from design.cells.sheet import Sheet
 
 Array = NDArray[np.float64]
@@ -90,6 +90,7 @@ class Model:
     edge_mm: float
     mu: float  # per Young's modulus
     lam: float
+    density: Density
     ties: Ties
 
     def nodes(self, y: Array, s_ratio: float) -> Array:
@@ -129,7 +130,9 @@ def model(
     rule: tuple[Array, Array] = THREE_POINTS,
 ) -> Model:
     """Return the sector of the cell (t, θ); its polygon must be sound (`geometry.fault`)."""
-    rest = nodes_mm(vertices_mm(sector(t_mm, theta_rad, sheet), density), density)
+    part = sector(t_mm, theta_rad, sheet)
+    density = fitting(part, density)
+    rest = nodes_mm(vertices_mm(part, density), density)
     return model_of(rest, sheet, density, rule)
 
 
@@ -138,7 +141,7 @@ def model_of(rest_mm: Array, sheet: Sheet, density: Density, rule: tuple[Array, 
     elements = topology(density).elements
     grads, weights = gradients(rest_mm, elements, rule)
     mu, lam = kernels.lame_MPa(1.0, sheet.nu_ratio)
-    return Model(rest_mm, elements, grads, weights, sheet.hinge_mm, sheet.edge_mm, mu, lam, ties(density))
+    return Model(rest_mm, elements, grads, weights, sheet.hinge_mm, sheet.edge_mm, mu, lam, density, ties(density))
 
 
 @dataclass(frozen=True, slots=True)

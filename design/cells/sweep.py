@@ -71,8 +71,7 @@ def solver_hash() -> str:
 
 def thetas_rad(plan: Plan) -> Array:
     """Return the columns' angles."""
-    angles: Array = np.linspace(-THETA_LIMIT_RAD, THETA_LIMIT_RAD, plan.theta_count)
-    return angles
+    return np.linspace(-THETA_LIMIT_RAD, THETA_LIMIT_RAD, plan.theta_count)
 
 
 def column_t_mm(plan: Plan, theta_rad: float) -> Array:
@@ -80,7 +79,7 @@ def column_t_mm(plan: Plan, theta_rad: float) -> Array:
     low, high = t_bounds_mm(theta_rad, plan.sheet)
     low = max(low, LEAST_T_RATIO * plan.edge_mm)
     count = math.floor((high - low) / plan.t_step_mm + 1e-9) + 1
-    return low + plan.t_step_mm * np.arange(max(count, 0))
+    return np.asarray(low + plan.t_step_mm * np.arange(max(count, 0)), dtype=np.float64)
 
 
 def solve_column(plan: Plan, theta_rad: float) -> list[Cell]:
@@ -94,7 +93,7 @@ def solve_column(plan: Plan, theta_rad: float) -> list[Cell]:
             cells.append(Cell(float(t_mm), theta_rad, found.verdict, found.reason, found.residual_ratio))
             before = []
         else:
-            cells.append(homogenise.numbers(float(t_mm), theta_rad, found[0], found[1], plan.density))
+            cells.append(homogenise.numbers(float(t_mm), theta_rad, found[0], found[1]))
             before = [*before[-1:], found[1]]
     return cells
 

@@ -57,10 +57,10 @@ def _assembly(density: Density) -> tuple[Array, int]:
     return np.delete(maps, (3, 4), axis=2), len(shared)
 
 
-def condensed(m: Model, nodes: Array, density: Density) -> Array:
+def condensed(m: Model, nodes: Array) -> Array:
     """Return the sector's Hessian at `nodes` (n, 2) condensed onto its shared nodes, (edge, edge)."""
-    inside, border, size, width = _numbering(density)
-    edge = 2 * len(border_nodes(density))
+    inside, border, size, width = _numbering(m.density)
+    edge = 2 * len(border_nodes(m.density))
     _, _, h = kernels.element_derivatives(nodes, m.elements, m.grads, m.weights, m.mu, m.lam)
     band, couple, rim = kernels.split(h, m.elements, inside, border, size, width, edge)
     kernels.factor_band(band)
@@ -77,10 +77,10 @@ class Moduli:
     anisotropy_ratio: float  # how far the tangent is from isotropic; three-fold symmetry makes it zero
 
 
-def moduli(m: Model, nodes: Array, density: Density) -> Moduli:
+def moduli(m: Model, nodes: Array) -> Moduli:
     """Return the tangent moduli about the equilibrium `nodes` of the sector."""
-    maps, _ = _assembly(density)
-    small = condensed(m, nodes, density)
+    maps, _ = _assembly(m.density)
+    small = condensed(m, nodes)
     maps = maps.copy()
     maps[:, :, :3] *= m.edge_mm
     whole = 3 * np.einsum("cap,ab,cbq->pq", maps, small, maps, optimize=True)
