@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import io
 import json
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -79,6 +80,11 @@ class CellLibrary:
         codes = Counter(self.table["verdict"].astype(int).tolist())
         return {name: codes.get(k, 0) for k, name in enumerate(VERDICTS)}
 
+    def reasons(self) -> dict[str, int]:
+        """Return why candidates are not in the library, most frequent first; figures inside a reason are left out."""
+        words = [_general(self.meta["reasons"][int(k)]) for k in self.table["reason"][self.table["verdict"] != 0]]
+        return dict(Counter(words).most_common())
+
     def at(self, t_mm: Array | float, theta_rad: Array | float) -> CellProperties:
         """Return the cells (t, θ), broadcast; NaN and `inside` False where no bistable cells surround the point."""
         t, theta = np.broadcast_arrays(np.asarray(t_mm, dtype=float), np.asarray(theta_rad, dtype=float))
@@ -99,6 +105,10 @@ class CellLibrary:
                 "build one with `fabctl library build`"
             )
         return _with_sheet(self.table, self.meta, self.hash, sheet)
+
+
+def _general(reason: str) -> str:
+    return re.sub(r":? (up to the stretch )?-?\d[\d.e+-]*( mm²)?$", "", reason)
 
 
 def shape_of(sheet: Sheet) -> tuple[float, float, float]:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from design.cells.sheet import Sheet
 from fabctl.config.bench import Positive, find
 from fabctl.config.loader import Model, load
 
@@ -52,3 +53,16 @@ class MaterialConfig(Model):
 def load_material(name: str, home: Path) -> MaterialConfig:
     """Return the material called `name`, or the one in the file of that path."""
     return load(find("materials", name, home), MaterialConfig)
+
+
+def sheet_of(material: MaterialConfig) -> Sheet:
+    """Return the cell's constants of a material."""
+    return Sheet(
+        edge_mm=material.edge_mm,
+        slit_mm=material.slit_mm,
+        hinge_mm=material.hinge_mm,
+        thickness_mm=material.thickness_mm,
+        E_MPa=material.E_MPa,
+        nu_ratio=material.nu_ratio,
+        density_kg_m3=material.density_kg_m3,
+    )

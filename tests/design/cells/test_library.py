@@ -45,6 +45,18 @@ def test_a_point_on_the_grid_is_given_back_exactly(library: CellLibrary) -> None
     np.testing.assert_allclose(cells.Y_N_mm, library.Y_N_mm[some], rtol=1e-9)
 
 
+def test_every_candidate_of_the_paper_is_decided(library: CellLibrary) -> None:
+    counts = library.counts()
+    assert sum(counts.values()) == 7552
+    assert counts["invalid"] == counts["not converged"] == 0
+    assert sum(library.reasons().values()) == counts["not bistable"]
+
+
+def test_the_range_is_the_published_one(library: CellLibrary) -> None:
+    low, high = library.range_ratio()  # Chen et al. 2021: 1.129 to 1.775
+    assert low == pytest.approx(1.129, abs=0.005) and high == pytest.approx(1.775, abs=0.005)
+
+
 def test_outside_the_map_there_is_no_number(library: CellLibrary) -> None:
     cells = library.at(np.array([5.0, 0.5, 1.0]), np.array([0.0, 0.5, 1.0]))
     assert not cells.inside.any() and np.isnan(cells.expansion_ratio).all()

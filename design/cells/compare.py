@@ -1,0 +1,189 @@
+"""A published table of cells against this solver: each row solved afresh, and the shipped map interpolated."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.cells import homogenise
+from design.cells.geometry import strip_mm
+from design.cells.homogenise import Cell, Failure, Pair
+from design.cells.library import CellLibrary
+from design.cells.mesh import REFERENCE, Density
+from design.cells.sheet import Sheet
+
+Array = NDArray[np.float64]
+
+COMPARABLE_STRIP_RATIO = 0.01  # t_s/edge: below, the published map is resampled over its own border
+COMPARABLE_BARRIER = 0.3  # in the published unit
+COMPARABLE_THETA_RAD = 0.26
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """A table of cells in the published units, (n,) each: t and energies relative, expansion as a ratio."""
+
+    t_mm: Array
+    theta_rad: Array
+    expansion_ratio: Array
+    barrier_ratio: Array
+    stiffness_ratio: Array
+
+    def comparable(self, sheet: Sheet) -> NDArray[np.bool_]:
+        """Return where the table is not an artefact of its own resampling."""
+        pairs = zip(self.t_mm, self.theta_rad, strict=True)
+        strip = np.array([strip_mm(t, theta, sheet) for t, theta in pairs]) / sheet.edge_mm
+        loud = self.barrier_ratio > COMPARABLE_BARRIER
+        return np.asarray((strip > COMPARABLE_STRIP_RATIO) & loud & (self.theta_rad <= COMPARABLE_THETA_RAD))
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """How a set of errors lies: absolute for expansions, relative for energies."""
+
+    count: int
+    median: float
+    q95: float
+    q99: float
+    worst: float
+
+    @staticmethod
+    def of(errors: Array) -> Spread:
+        """Return the spread of the finite `errors`, taken positive."""
+        good = np.abs(errors[np.isfinite(errors)])
+        if not len(good):
+            return Spread(0, np.nan, np.nan, np.nan, np.nan)
+        return Spread(len(good), *map(float, np.quantile(good, [0.5, 0.95, 0.99, 1.0])))
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Errors of one way to get the numbers, over a subset of the table."""
+
+    rows_count: int
+    answered_count: int
+    scale: float  # published energy per mm² of ours, one number for stiffness and barrier
+    expansion: Spread
+    expansion_bias_ratio: float
+    stiffness: Spread
+    barrier: Spread
+    worst: tuple[int, ...]  # rows of the table, worst expansion first
+
+
+def read_published(text: str, sheet: Sheet) -> Published:
+    """Return the table in `text`: t_over_l0, theta_rad, expansion_ratio, energy_barrier, stiffness, under a header."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    names = [name.strip() for name in lines[0].split(",")]
+    wanted = ["t_over_l0", "theta_rad", "expansion_ratio", "energy_barrier", "stiffness"]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise ValueError(f"no column {', '.join(missing)}; the header must name {', '.join(wanted)}")
+    rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    t, theta, expansion, barrier, stiffness = (rows[:, names.index(name)] for name in wanted)
+    return Published(t * sheet.edge_mm, theta, expansion, barrier, stiffness)
+
+
+def solve_rows(
+    table: Published,
+    sheet: Sheet,
+    density: Density = REFERENCE,
+    jobs: int = 1,
+    done: Callable[[int], None] | None = None,
+) -> list[Cell]:
+    """Return each row of the table solved; rows of one θ follow each other, so each starts from its neighbours."""
+    columns = [np.flatnonzero(table.theta_rad == theta) for theta in np.unique(table.theta_rad)]
+    columns = [rows[np.argsort(table.t_mm[rows], kind="stable")] for rows in columns]
+    works = [(table.t_mm[rows], float(table.theta_rad[rows[0]]), sheet, density) for rows in columns]
+    found: list[Cell | None] = [None] * len(table.t_mm)
+    from joblib import Parallel, delayed
+
+    finished = 0
+    solved = Parallel(n_jobs=jobs, return_as="generator")(delayed(_column)(*work) for work in works)
+    for rows, cells in zip(columns, solved, strict=True):
+        for row, cell in zip(rows, cells, strict=True):
+            found[row] = cell
+        finished += len(rows)
+        if done is not None:
+            done(finished)
+    return [cell for cell in found if cell is not None]
+
+
+def _column(t_mm: Array, theta_rad: float, sheet: Sheet, density: Density) -> list[Cell]:
+    cells = []
+    before: list[Pair] = []
+    steps = np.diff(t_mm, prepend=np.nan)
+    for k, t in enumerate(t_mm):
+        even = len(before) == 2 and abs(steps[k] / steps[k - 1] - 1) < 0.2
+        found = homogenise.solve_pair(
+            float(t), theta_rad, sheet, density, homogenise.predicted(*before) if even else None
+        )
+        if isinstance(found, Failure):
+            cells.append(Cell(float(t), theta_rad, found.verdict, found.reason, found.residual_ratio))
+            before = []
+        else:
+            cells.append(homogenise.numbers(float(t), theta_rad, found[0], found[1]))
+            before = [*before[-1:], found[1]]
+    return cells
+
+
+def columns_of(cells: list[Cell]) -> tuple[Array, Array, Array]:
+    """Return expansion, stiffness and barrier of the cells, NaN where there is none."""
+
+    def column(name: str) -> Array:
+        return np.array([np.nan if (v := getattr(c, name)) is None else v for c in cells], dtype=float)
+
+    return column("expansion_ratio"), column("stiffness_mm2"), column("barrier_mm2")
+
+
+def interpolated(table: Published, library: CellLibrary) -> tuple[Array, Array, Array]:
+    """Return expansion, stiffness and barrier of the rows read off the library's map."""
+    cells = library.at(table.t_mm, table.theta_rad)
+    return cells.expansion_ratio, cells.stiffness_mJ, cells.barrier_mJ
+
+
+def compared(
+    table: Published, numbers: tuple[Array, Array, Array], subset: NDArray[np.bool_], scale: float | None = None
+) -> Comparison:
+    """Return the errors over `subset`; the one scale is fitted to the stiffness there unless given."""
+    expansion, stiffness, barrier = (values[subset] for values in numbers)
+    if scale is None:
+        scale = float(np.nanmedian(table.stiffness_ratio[subset] / stiffness))
+    error = expansion - table.expansion_ratio[subset]
+    order = np.argsort(-np.where(np.isfinite(error), np.abs(error), -1.0))[:5]
+    return Comparison(
+        rows_count=int(subset.sum()),
+        answered_count=int(np.isfinite(expansion).sum()),
+        scale=scale,
+        expansion=Spread.of(error),
+        expansion_bias_ratio=float(np.nanmedian(error)),
+        stiffness=Spread.of(scale * stiffness / table.stiffness_ratio[subset] - 1),
+        barrier=Spread.of(scale * barrier / table.barrier_ratio[subset] - 1),
+        worst=tuple(int(row) for row in np.flatnonzero(subset)[order]),
+    )
+
+
+def verdicts(cells: list[Cell]) -> dict[str, int]:
+    """Return how many cells came to each verdict."""
+    return dict(Counter(cell.verdict for cell in cells))
+
+
+def edge_verdicts(
+    table: Published, sheet: Sheet, steps: int = 4, density: Density = REFERENCE
+) -> list[tuple[Cell, Cell]]:
+    """Return, per column of the table, the cells `steps` of its grid inside and outside its upper edge in t."""
+    spacing = float(np.median(np.diff(np.unique(np.round(table.t_mm, 9)))))
+    result = []
+    for theta in np.unique(table.theta_rad):
+        edge = float(table.t_mm[table.theta_rad == theta].max())
+        low = float(table.t_mm[table.theta_rad == theta].min())
+        if edge - steps * spacing < low - 1e-9:
+            continue  # the column is shorter than that
+        inside, outside = (
+            homogenise.solve_cell(edge + sign * steps * spacing, float(theta), sheet, density) for sign in (-1, 1)
+        )
+        result.append((inside, outside))
+    return result
