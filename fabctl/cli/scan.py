@@ -156,6 +156,7 @@ def _newest(inbox: Path) -> Path:
 def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: bool) -> int:
     """Compare, write the run record, show the result; return the exit code."""
     from fabctl.records.folder import start_run
+    from fabctl.reports.scan import write_scan_report
     from fabctl.scan.job import compare, record
 
     missing = [str(p) for p in request.files() if not p.is_file()]
@@ -173,6 +174,7 @@ def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: 
     try:
         made = compare(request, emit)
         body = record(run, made)
+        page = write_scan_report(run)
     except KeyboardInterrupt:
         run.finish("stopped", "stopped by the operator")
         raise Stopped("stopped") from None
@@ -180,7 +182,7 @@ def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: 
         run.finish("refused" if isinstance(fault, RefusedError) else "failed", str(fault))
         raise
     run.finish("refused" if made.exit_code == 3 else "done", _sentence(body), verdict=body["verdict"])
-    show({"run": run.run_id, "folder": str(run.path), **body}, as_json, _lines(body, run.path))
+    show({"run": run.run_id, "folder": str(run.path), "report": str(page), **body}, as_json, _lines(body, page))
     return made.exit_code
 
 
@@ -194,7 +196,7 @@ def _sentence(body: dict[str, Any]) -> str:
     )
 
 
-def _lines(body: dict[str, Any], folder: Path) -> list[str]:
+def _lines(body: dict[str, Any], page: Path) -> list[str]:
     lines = [_sentence(body)]
     found = body.get("deviation")
     if found is not None:
@@ -213,4 +215,4 @@ def _lines(body: dict[str, Any], folder: Path) -> list[str]:
             f"it knew {model['known_frac']:.0%} of the deviation"
         )
     lines += [f"{f['level']} {f['code']}: {f['message']}" for f in body["findings"]]
-    return [*lines, f"record: {folder}"]
+    return [*lines, f"report: {page}"]

@@ -12,7 +12,7 @@ from fabctl.records.folder import RunFolder, sha256, status_of
 from fabctl.reports.design_step import cut_step, design_step
 from fabctl.reports.indent_step import indent_step
 from fabctl.reports.model import Fact, Provenance, Report, Step, Word
-from fabctl.reports.scan_step import scan_step
+from fabctl.reports.scan import scan_step
 from fabctl.reports.view3d import script
 from fabctl.workspace import Specimen, Workspace
 

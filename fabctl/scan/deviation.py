@@ -20,6 +20,7 @@ PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
 COVER_SAMPLES = 5000
 COVER_LEAST_FRAC = 0.01  # of the diagonal; a target sample with a point this near is covered
 LONE_LIMIT = 4.0  # times the patch's own scatter: a point that far from its patch's median is a wrong match
+CROWD_RATIO = 0.15  # a patch with less than this part of the usual number of points holds only wrong matches
 RESAMPLES = 200
 
 
@@ -94,6 +95,9 @@ def deviate(points: Floats, pose: Similarity, target: Target) -> Deviation:
     usual = float(np.median(off[inner])) if inner.any() else 0.0
     with np.errstate(invalid="ignore"):
         lone = inner & (off > LONE_LIMIT * 1.4826 * np.maximum(scatter, usual))
+    crowd = np.bincount(patch[inner], minlength=tree.n)
+    usual_count = float(np.median(crowd[crowd > 0])) if inner.any() else 0.0
+    lone |= inner & (crowd[patch] < CROWD_RATIO * usual_count)
     counts = inner & ~lone
     number = np.bincount(patch[counts], minlength=tree.n)
     weight = np.where(counts, 1.0 / np.maximum(number[patch], 1), 0.0)

@@ -17,6 +17,7 @@ from fabctl.events import Emit, Event, silent
 from fabctl.records.folder import RunFolder
 from fabctl.scan.clean import Cleaned, clean
 from fabctl.scan.cloud import Cloud, read_cloud, read_labelled, write_csv, write_ply
+from fabctl.scan.colours import colours_of, span_mm
 from fabctl.scan.deviation import Deviation, Statistics, Uncertainty, bootstrap, deviate, statistics
 from fabctl.scan.markers import Scale, scale_from_board
 from fabctl.scan.refine import Options, refine
@@ -232,6 +233,8 @@ def result(made: Comparison) -> dict[str, Any]:
         ]
     if made.statistics is not None:
         body["deviation"] = statistics_facts(made.statistics)
+        if made.request.tolerance_frac is not None:
+            body["within_tolerance_frac"] = made.statistics.within(made.request.tolerance_frac)
     if made.uncertainty is not None:
         body["uncertainty"] = {k: _finite(v) for k, v in asdict(made.uncertainty).items()}
     if made.scale is not None:
@@ -299,21 +302,33 @@ def _finite(value: Any) -> Any:
 
 
 def record(run: RunFolder, made: Comparison) -> dict[str, Any]:
-    """Write result, CSV and coloured PLY into the run folder; return the result."""
-    body = result(made)
-    if made.deviation is not None:
-        from fabctl.scan.colours import colours_of, span_mm
+    """Write result, CSV, coloured PLY, map and pictures into the run folder; return the result."""
+    from fabctl.scan.pictures import cleaning_picture, kinds
 
-        span = span_mm(made.deviation)
-        found = made.deviation
-        write_csv(run.artefact("deviation.csv"), found.points_mm, found.value_mm, found.area_weight, found.counts)
-        write_ply(run.artefact("deviation.ply"), found.points_mm, found.value_mm, colours_of(found.value_mm, span))
-        np.savez_compressed(
-            run.artefact("map.npz"),
-            vertices_mm=made.target.mesh.vertices_mm,
-            faces=made.target.mesh.faces,
-            deviation_mm=found.vertex_mm,
-        )
-        body["colour_span_mm"] = span
+    body = result(made)
+    up = None if made.cleaned.table is None else made.cleaned.table.normal
+    cleaning_picture(made.cloud.points, kinds(made.cleaned, made.registration.specimen), up).save(
+        run.artefact("cleaning.png")
+    )
+    if made.deviation is not None:
+        body["colour_span_mm"] = _record_deviation(run, made, made.deviation)
     run.write_result(body)
     return body
+
+
+def _record_deviation(run: RunFolder, made: Comparison, found: Deviation) -> float:
+    """Write points, map and pictures of the deviation; return the span of their colours."""
+    from fabctl.scan.pictures import SIDES, histogram_svg, map_picture, write_bar
+
+    span, mesh, size = span_mm(found), made.target.mesh, made.target.diagonal_mm
+    write_csv(run.artefact("deviation.csv"), found.points_mm, found.value_mm, found.area_weight, found.counts)
+    write_ply(run.artefact("deviation.ply"), found.points_mm, found.value_mm, colours_of(found.value_mm, span))
+    np.savez_compressed(
+        run.artefact("map.npz"), vertices_mm=mesh.vertices_mm, faces=mesh.faces, deviation_mm=found.vertex_mm
+    )
+    for side in SIDES:
+        map_picture(mesh, found.vertex_mm, span, side).save(run.artefact(f"map-{side}.png"))
+    text = histogram_svg(found, span, size, made.request.tolerance_frac)
+    run.artefact("histogram.svg").write_text(text, encoding="utf-8")
+    write_bar(run.artefact("bar.svg"), span, size)
+    return span

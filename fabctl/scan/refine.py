@@ -32,6 +32,8 @@ FLOOR_FRAC = 2e-5  # of the diagonal; below it a patch's residual is rounding, n
 RIM_REACH_FRAC = 0.05  # of the diagonal; how far from the border points may tell where the cloud's edge is
 RIM_REACH_FIRST_FRAC = 0.14  # likewise in the first step, while the surface may still have to slide
 RIM_QUANTILE = 0.96
+SLID_FRAC = 1e-3  # of the diagonal; a step this small ends the sliding
+SLIDING_SIGMA_FRAC = 2e-3  # while sliding, patches hold no tighter than this and the rim pulls with its median
 GROW_LIMIT_RATIO = 0.05
 
 Weighting = Literal["robust", "least-squares"]
@@ -89,16 +91,18 @@ def refine(points: Floats, start: Similarity, target: Target, options: Options =
         steps_count += 1
         rows = patch_rows(points, pose, target, patch_tree, band) if options.use_patches else _no_rows()
         rim = rim_rows(points, pose, target, reach) if options.use_rim else None
-        x, weight, rim_weight, sigma = solve(rows, rim, options)
+        sliding = reach > RIM_REACH_FRAC
+        x, weight, rim_weight, sigma = solve(rows, rim, options, sliding=sliding)
         moved = float(np.linalg.norm(x[:3]) * 0.5 + np.linalg.norm(x[3:6]) + 0.5 * abs(x[6]))
         pose = moved_by(pose, x, target)
-        band, slid = max(0.6 * band, 0.02, 12 * sigma), reach == RIM_REACH_FRAC
-        reach = max(0.75 * reach, RIM_REACH_FRAC) if moved < 0.02 else reach
-        if moved < options.still_frac and slid:
+        band = max(0.6 * band, 0.02, 12 * sigma)
+        if sliding and (moved < SLID_FRAC or steps_count >= options.steps_count // 2):
+            reach = RIM_REACH_FRAC
+        elif moved < options.still_frac:
             break
     rows = patch_rows(points, pose, target, patch_tree, band) if options.use_patches else _no_rows()
     rim = rim_rows(points, pose, target, RIM_REACH_FRAC) if options.use_rim else None
-    _, weight, rim_weight, sigma = solve(rows, rim, options)
+    _, weight, rim_weight, sigma = solve(rows, rim, options, sliding=False)
     return Fit(pose, rows, rim, weight, rim_weight, sigma, steps_count, moved)
 
 
@@ -215,7 +219,7 @@ def _mean_by(values: Floats, group: Ints) -> Floats:
     return np.asarray(np.bincount(group, values) / np.maximum(np.bincount(group), 1))
 
 
-def solve(rows: Rows, rim: Rows | None, options: Options) -> tuple[Floats, Floats, Floats, float]:
+def solve(rows: Rows, rim: Rows | None, options: Options, *, sliding: bool) -> tuple[Floats, Floats, Floats, float]:
     """Return the motion, the weights of patches and of rim stretches, and the patches' robust spread.
 
     Weights begin with the median fit (1/|r|) and narrow to Tukey's about the spread found, which is re-estimated, so
@@ -231,16 +235,26 @@ def solve(rows: Rows, rim: Rows | None, options: Options) -> tuple[Floats, Float
         sigma = _spread(r) if len(r) else 0.0
         if rim is not None:
             e = rim.residual + rim.jacobian @ x[:7] - x[7]
-            close = np.abs(e) < 3 * rim.spread[0]
-            rim_sigma = min(max(_spread(e[close]) if close.sum() > 5 else 1.0, 5e-4), float(rim.spread[0]))
-            # What sticks out over the border speaks against the pose; what is missing may just not have been seen.
-            rim_weight = np.where(e > 0, rim_sigma / np.maximum(e, rim_sigma), _tukey(e, 3.0 * rim_sigma))
+            rim_weight, rim_sigma = _rim_weights(e, float(rim.spread[0]), sliding)
+            sigma = max(sigma, SLIDING_SIGMA_FRAC) if sliding else sigma
         if options.weighting == "least-squares" or k == rounds:
             break
         width = np.maximum(sigma, rows.spread)
         narrow = TUKEY * width * (1.5 if k < 15 else 1.0)
         weight = width / np.maximum(np.abs(r), width) if k < 10 else _tukey(r, narrow)
     return x[:7], weight, rim_weight, sigma
+
+
+def _rim_weights(e: Floats, limit_frac: float, sliding: bool) -> tuple[Floats, float]:
+    """Return the weights of the rim's stretches and their spread.
+
+    What sticks out over the border always speaks against the pose; what is missing may just not have been seen.
+    """
+    if sliding:
+        return SLIDING_SIGMA_FRAC / np.maximum(np.abs(e), SLIDING_SIGMA_FRAC), SLIDING_SIGMA_FRAC
+    close = np.abs(e) < 3 * limit_frac
+    sigma = min(max(_spread(e[close]) if close.sum() > 5 else 1.0, 5e-4), limit_frac)
+    return np.where(e > 0, sigma / np.maximum(e, sigma), _tukey(e, 3.0 * sigma)), sigma
 
 
 def _spread(residual: Floats) -> float:

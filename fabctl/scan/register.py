@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 
 RIVAL_RATIO = 1.10  # poses that fit within this of the best are listed, and must be explained
 SEARCH_POINTS = 4000
-FIT_POINTS = 15_000  # for judging poses; the chosen one is refined with FINAL_POINTS
+FIT_POINTS = 8_000  # for judging poses; the chosen one is refined with FINAL_POINTS
 FINAL_POINTS = 150_000
 DENSE_POINTS = 60_000
 KEEP_CLOUD_FRAC, KEEP_TARGET_FRAC = 0.92, 0.7  # the rest is held at its edge: outliers, and what was not seen
