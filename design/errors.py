@@ -47,6 +47,10 @@ class OutOfLibrary(DesignError):
         self.low_ratio, self.high_ratio, self.limits_ratio = low_ratio, high_ratio, limits_ratio
 
 
+class BundleError(DesignError):
+    """A design folder is missing a file, was edited after the build, or is of another version."""
+
+
 class NotConverged(DesignError):
     """A solver stopped without an answer; says how far it came."""
 

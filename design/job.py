@@ -49,10 +49,12 @@ def compose_job(
     presets: Mapping[Layer, LayerPreset],
     options: JobOptions = JobOptions(),
     id_text: str = "",
+    code: Sequence[CutPath] = (),
     remarks: Iterable[str] = (),
 ) -> Job:
     """Return the program that cuts `drawing` and engraves `id_text` at its anchor.
 
+    `code` are further strokes to engrave, in sheet millimetres: the id's code, drawn into the drawing's `code_box`.
     Raises `DesignError` where a layer has no preset, the id has no place, or a path cannot be cut with this kerf.
     """
     paths = list(drawing.paths)
@@ -60,6 +62,7 @@ def compose_job(
         if drawing.id_anchor is None:
             raise DesignError(f"the drawing keeps no place for an id, so {id_text!r} cannot be engraved")
         paths += text_strokes(id_text, drawing.id_anchor)
+    paths += code
     if not paths:
         raise DesignError("nothing is drawn, so there is nothing to cut")
     strokes = strokes_of(paths, options.tool)

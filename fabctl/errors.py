@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from design.errors import BundleError as BundleError  # one error, whoever finds the folder wanting
 from design.findings import Finding
 
 DONE, BUG, USAGE, REFUSED, DEVICE, OPERATOR, OUT_OF_TOLERANCE = range(7)
@@ -32,10 +33,6 @@ class UsageError(FabctlError):
     """The command asks for something that is not there: an unknown specimen, a missing file."""
 
     exit_code = USAGE
-
-
-class BundleError(FabctlError):
-    """A design folder is missing a file, was edited after the build, or is of another version."""
 
 
 class RefusedError(FabctlError):

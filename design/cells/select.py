@@ -20,6 +20,8 @@ Rule = Literal["smooth", "stiffest", "barrier", "published"]
 
 STEP_RATIO = 0.001  # of expansion, between the table's rows: a fifth of the published rule's window
 WINDOW_RATIO = 0.005  # the published rule takes the stiffest entry that comes this close
+DENSE_COLUMNS_COUNT, DENSE_ROWS_COUNT = 241, 401  # where the library interpolates itself: 0.17°, 0.006 mm
+CHUNK_COUNT = 4000  # expansions looked up at a time
 COLUMNS_LIMIT_COUNT = 400  # a library with more distinct angles than this is not a set of columns
 REFINE_COUNT = 33  # finer angles on which the smooth curve is looked for once more, about the coarse one
 REFINE_ROUNDS_COUNT = 4
@@ -93,7 +95,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class SelectionCurve:
-    """The rule, worked out over the whole range once; `at` is then an interpolation."""
+    """The rule, worked out over the whole range once, one row per step of expansion."""
 
     options: SelectionOptions
     expansion_ratio: Array  # (m,) rising
@@ -102,6 +104,7 @@ class SelectionCurve:
     stiffness_mJ: Array  # (m,)
     barrier_mJ: Array  # (m,)
     best_stiffness_mJ: Array  # (m,) the isoline's stiffest point, to say what the curve gave up
+    table: Table  # what it was chosen from
 
     def range_ratio(self) -> tuple[float, float]:
         """Return the least and the greatest expansion the rule can serve."""
@@ -139,8 +142,32 @@ class _Column:
     barrier_mJ: Array
 
 
+@dataclass(frozen=True, slots=True)
+class _Samples:
+    """A library interpolated at many more points than it has cells."""
+
+    t_mm: Array
+    theta_rad: Array
+    expansion_ratio: Array
+    barrier_mJ: Array
+    stiffness_mJ: Array
+
+
+def _densely(library: CellMap) -> CellMap:
+    """Return the library on dense columns where it can interpolate itself, else as it is."""
+    at = getattr(library, "at", None)
+    if at is None:
+        return library
+    theta_rad = np.linspace(library.theta_rad.min(), library.theta_rad.max(), DENSE_COLUMNS_COUNT)
+    t_mm = np.linspace(library.t_mm.min(), library.t_mm.max(), DENSE_ROWS_COUNT)
+    cells = at(*(grid.ravel() for grid in np.meshgrid(t_mm, theta_rad)))
+    fields = (cells.t_mm, cells.theta_rad, cells.expansion_ratio, cells.barrier_mJ, cells.stiffness_mJ)
+    return _Samples(*(field[cells.inside] for field in fields))
+
+
 def _columns(library: CellMap, floor_mJ: float) -> list[_Column]:
     found = []
+    library = _densely(library)
     angles, which = np.unique(np.round(library.theta_rad, 7), return_inverse=True)
     if len(angles) > COLUMNS_LIMIT_COUNT:
         raise DesignError(
@@ -168,17 +195,18 @@ def selection_curve(library: CellMap, options: SelectionOptions = SelectionOptio
     table = table_of(library, options.barrier_floor_mJ)
     stiffness = np.where(np.isnan(table.stiffness_mJ), -np.inf, table.stiffness_mJ)
     best = stiffness.max(axis=1)
-    if options.rule == "barrier":
-        barrier = np.where(np.isnan(table.barrier_mJ), -np.inf, table.barrier_mJ)
-        theta_rad = table.theta_rad[np.argmax(barrier, axis=1)]
-    elif options.rule == "smooth":
+    if options.rule == "smooth":
         theta_rad = _smooth_path(table, options.max_stiffness_loss_frac)
     else:
-        theta_rad = table.theta_rad[np.argmax(stiffness, axis=1)]
+        theta_rad = table.theta_rad[_best_column(table.barrier_mJ if options.rule == "barrier" else table.stiffness_mJ)]
     values = [_along(table, value, theta_rad) for value in (table.t_mm, table.stiffness_mJ, table.barrier_mJ)]
     rows = slice(_smooth_from(values[0]) if options.rule == "smooth" else 0, None)
     t, chosen, barrier = (value[rows] for value in values)
-    return SelectionCurve(options, table.expansion_ratio[rows], t, theta_rad[rows], chosen, barrier, best[rows])
+    return SelectionCurve(options, table.expansion_ratio[rows], t, theta_rad[rows], chosen, barrier, best[rows], table)
+
+
+def _best_column(value: Array) -> NDArray[np.int64]:
+    return np.asarray(np.argmax(np.where(np.isnan(value), -np.inf, value), axis=1))
 
 
 def _smooth_from(t_mm: Array) -> int:
@@ -212,23 +240,24 @@ def on_curve(curve: SelectionCurve, expansion_ratio: Array, slack_ratio: float =
             np.interp(wanted, curve.expansion_ratio, y)
             for y in (curve.t_mm, curve.theta_rad, curve.stiffness_mJ, curve.barrier_mJ)
         ]
-    else:  # the curve may jump between two rows: take one side of the jump, never a point between
-        values = _row_by_row(curve, wanted)
+    else:  # the best point may jump from column to column: look at all of them, at this very expansion
+        parts = np.array_split(wanted, max(1, len(wanted) // CHUNK_COUNT))
+        values = [np.concatenate(column) for column in zip(*(_best_at(curve, part) for part in parts), strict=True)]
     return Choice(values[0], values[1], wanted, values[2], values[3])
 
 
-def _row_by_row(curve: SelectionCurve, wanted: Array) -> list[Array]:
-    rows = curve.expansion_ratio
+def _best_at(curve: SelectionCurve, wanted: Array) -> tuple[Array, Array, Array, Array]:
+    """Return t, theta, stiffness and barrier of the rule's best column at each wanted expansion."""
+    table = curve.table
+    rows = table.expansion_ratio
     k = np.clip(np.searchsorted(rows, wanted, side="right") - 1, 0, len(rows) - 2)
-    share = (wanted - rows[k]) / (rows[k + 1] - rows[k])
-    same = np.abs(curve.theta_rad[k + 1] - curve.theta_rad[k]) < 1e-9
-    values = []
-    for y in (curve.t_mm, curve.theta_rad, curve.stiffness_mJ, curve.barrier_mJ):
-        within = y[k] + share * (y[k + 1] - y[k])
-        # Across a change of column the row's own slope carries on along the column it left.
-        before = np.where(k > 0, y[k] + share * (y[k] - y[np.maximum(k - 1, 0)]), y[k])
-        values.append(np.where(same, within, np.where(y is curve.theta_rad, y[k], before)))
-    return values
+    share = ((wanted - rows[k]) / (rows[k + 1] - rows[k]))[:, None]
+    t, stiffness, barrier = (
+        (1 - share) * value[k] + share * value[k + 1] for value in (table.t_mm, table.stiffness_mJ, table.barrier_mJ)
+    )
+    pick = _best_column(barrier if curve.options.rule == "barrier" else stiffness)
+    here = np.arange(len(wanted))
+    return t[here, pick], table.theta_rad[pick], stiffness[here, pick], barrier[here, pick]
 
 
 def _along(table: Table, value: Array, theta_rad: Array) -> Array:

@@ -15,7 +15,21 @@ UNITS_MM = 4  # $INSUNITS
 
 
 def dxf(paths: Sequence[CutPath], size_mm: tuple[float, float]) -> str:
-    """Return the sheet as DXF text that ezdxf's auditor finds nothing in; raise `DesignError` if it does."""
+    """Return the sheet as DXF text that ezdxf's auditor finds nothing in; raise `DesignError` if it does.
+
+    The text carries no date and no random id: the same sheet has the same hash.
+    """
+    import ezdxf
+
+    dated = ezdxf.options.write_fixed_meta_data_for_testing
+    ezdxf.options.write_fixed_meta_data_for_testing = True
+    try:
+        return _text(paths, size_mm)
+    finally:
+        ezdxf.options.write_fixed_meta_data_for_testing = dated
+
+
+def _text(paths: Sequence[CutPath], size_mm: tuple[float, float]) -> str:
     import ezdxf
     from ezdxf import units
 
@@ -34,10 +48,5 @@ def dxf(paths: Sequence[CutPath], size_mm: tuple[float, float]) -> str:
         faults = [str(fault.message) for fault in (*auditor.errors, *auditor.fixes)]
         raise DesignError(f"the DXF does not pass its audit: {'; '.join(faults[:5])}")
     text = io.StringIO()
-    dated = ezdxf.options.write_fixed_meta_data_for_testing
-    ezdxf.options.write_fixed_meta_data_for_testing = True  # no date, no random id: same sheet, same hash
-    try:
-        document.write(text)
-    finally:
-        ezdxf.options.write_fixed_meta_data_for_testing = dated
+    document.write(text)
     return text.getvalue()

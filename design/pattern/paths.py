@@ -20,10 +20,7 @@ class CutPath:
     points_mm: NDArray[np.float64]  # (n, 2), the closing point of a closed path not repeated
     closed: bool = False
     cell: int | None = None  # the cell it belongs to, where there is one
-
-    def is_half_slit(self) -> bool:
-        """A slit across an edge has three or five points; one of two begins inside and ends open, on the border."""
-        return self.layer == "slit" and not self.closed and len(self.points_mm) == 2
+    opens: bool = False  # a half slit, whose last point lies open on a border instead of before a hinge
 
 
 @dataclass(frozen=True, slots=True)

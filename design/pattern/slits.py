@@ -75,15 +75,16 @@ def slits_of(
     run = np.stack([c * along[..., 0] - s * along[..., 1], s * along[..., 0] + c * along[..., 1]], axis=-1)
 
     def line(offset_mm: Array) -> Array:
-        return np.asarray(corners + offset_mm[:, None, None] * down)
+        return np.asarray(corners + offset_mm[..., None] * down)
 
-    near, far = line(t_mm), line(t_mm + slit_mm)
+    own = np.repeat(t_mm[:, None], 3, axis=1)
+    near, far = line(own), line(own + slit_mm)
     before, before_run = np.roll(near, 1, axis=1), np.roll(run, 1, axis=1)
     kink = (_meet(before, before_run, near, run) + _meet(before, before_run, far, run)) / 2
-    start = line(t_mm + slit_mm / 2)
+    start = line(own + slit_mm / 2)
     after, after_run = np.roll(far, -1, axis=1), np.roll(run, -1, axis=1)
     inner = _meet(start, run, after, after_run) - (hinge_mm / math.sin(math.pi / 3))[:, None, None] * run
-    return Slits(_joined(tiling, start, cut), kink, inner)
+    return Slits(line(_joined(tiling, own, cut) + slit_mm / 2), kink, inner)
 
 
 def _meet(a: Array, a_run: Array, b: Array, b_run: Array) -> Array:
@@ -94,48 +95,46 @@ def _meet(a: Array, a_run: Array, b: Array, b_run: Array) -> Array:
     return np.asarray(a + share[..., None] * a_run)
 
 
-def _joined(tiling: Tiling, start_mm: Array, cut: NDArray[np.bool_]) -> Array:
-    """Return the edge ends with those of two cut cells on one edge moved to their mean."""
+def _joined(tiling: Tiling, t_mm: Array, cut: NDArray[np.bool_]) -> Array:
+    """Return t of every slit `(k, 3)`, that of two cut cells on one edge being their mean: by topology, so that a seam
+    that is joined again counts as one edge. Both cells of an edge measure t from the same corner."""
     _, which = tiling.edges()
     edge, weight = which.ravel(), np.repeat(cut.astype(np.float64), 3)
-    counts = np.maximum(1.0, np.bincount(edge, weight))
-    sums = [np.bincount(edge, weight * start_mm.reshape(-1, 2)[:, k]) for k in (0, 1)]
-    mean = np.column_stack(sums) / counts[:, None]
-    return np.asarray(mean[which])
+    total = np.bincount(edge, weight * t_mm.ravel())
+    return np.asarray((total / np.maximum(1.0, np.bincount(edge, weight)))[which])
 
 
 def slit_paths(tiling: Tiling, slits: Slits, cut: NDArray[np.bool_] | None = None) -> list[CutPath]:
     """Return one polyline per edge: across it where both cells are cut, from it inwards where only one is.
 
-    `cut` `(k,)` says which cells have slits at all; a passive cell has none.
+    `cut` `(k,)` says which cells have slits at all; a passive cell has none. On a seam each side keeps its own half.
     """
     cut = np.ones(len(tiling.cells), dtype=bool) if cut is None else cut
-    neighbour = tiling.neighbours()
-    _, which = tiling.edges()
-    slit_at = {(cell, int(edge)): k for cell, row in enumerate(which.tolist()) for k, edge in enumerate(row)}
+    ends = np.sort(np.stack([tiling.cells, np.roll(tiling.cells, 1, axis=1)], axis=2), axis=2).reshape(-1, 2)
+    _, edge = np.unique(ends, axis=0, return_inverse=True)  # as drawn: the two sides of a seam are two edges
+    mine = np.flatnonzero(np.repeat(cut, 3))
+    mine = mine[np.argsort(edge[mine], kind="stable")]
+    first = np.r_[True, edge[mine][1:] != edge[mine][:-1]]
+    last = np.r_[first[1:], True]
+    arms = np.stack([slits.inner_mm, slits.kink_mm, slits.edge_mm], axis=2).reshape(-1, 3, 2)
+    arm_count = np.where(_bends(arms), 3, 2)
     paths = []
-    for cell in np.flatnonzero(cut).tolist():
-        for k in range(3):
-            other = int(neighbour[cell, k])
-            if other >= 0 and cut[other] and other < cell:
-                continue  # drawn from the other side
-            points = [slits.inner_mm[cell, k], slits.kink_mm[cell, k], slits.edge_mm[cell, k]]
-            if other >= 0 and cut[other]:
-                m = slit_at[other, int(which[cell, k])]
-                points += [slits.kink_mm[other, m], slits.inner_mm[other, m]]
-            paths.append(CutPath("slit", _without_straight_kinks(np.array(points)), cell=cell))
+    for slot, is_first, is_last in zip(mine.tolist(), first.tolist(), last.tolist(), strict=True):
+        arm = arms[slot] if arm_count[slot] == 3 else arms[slot, ::2]
+        if is_first:
+            begun, owner = arm, slot // 3
+            if is_last:
+                paths.append(CutPath("slit", arm, cell=owner, opens=True))
+        else:
+            paths.append(CutPath("slit", np.concatenate([begun, arm[-2::-1]]), cell=owner))
     return paths
 
 
-def _without_straight_kinks(points_mm: Array) -> Array:
-    """Return the polyline without the kinks (points 1 and 3) that do not bend."""
-    keep = np.ones(len(points_mm), dtype=bool)
-    for k in range(1, len(points_mm) - 1, 2):
-        chord = points_mm[k + 1] - points_mm[k - 1]
-        arm = points_mm[k] - points_mm[k - 1]
-        length = math.hypot(chord[0], chord[1])
-        keep[k] = length > 0 and abs(chord[0] * arm[1] - chord[1] * arm[0]) / length > STRAIGHT_MM
-    return points_mm[keep]
+def _bends(arms_mm: Array) -> NDArray[np.bool_]:
+    """Say which arms `(n, 3, 2)` have a kink that is off the straight line between their ends."""
+    chord, part = arms_mm[:, 2] - arms_mm[:, 0], arms_mm[:, 1] - arms_mm[:, 0]
+    off = np.abs(chord[:, 0] * part[:, 1] - chord[:, 1] * part[:, 0])
+    return np.asarray(off > STRAIGHT_MM * np.linalg.norm(chord, axis=1))
 
 
 def outline_loops(tiling: Tiling) -> list[Array]:

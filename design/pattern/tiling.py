@@ -7,7 +7,7 @@ clockwise for an inverted one, which is its mirror image. Slit k of a cell leave
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -35,14 +35,16 @@ class Tiling:
     vertices_mm: Array  # (n, 2)
     cells: Index  # (k, 3) vertices, in the order of the slits
     inverted: NDArray[np.bool_]  # (k,)
+    twins: Index | None = None  # (n,) the vertex that each one becomes when a seam is joined; None without a seam
 
     def centres_mm(self) -> Array:
         """Return the cells' centroids, `(k, 2)`."""
         return np.asarray(self.vertices_mm[self.cells].mean(axis=1))
 
     def edges(self) -> tuple[Index, Index]:
-        """Return every edge's vertices `(e, 2)` and the edge that each slit leaves, `(k, 3)`."""
-        ends = np.sort(np.stack([self.cells, np.roll(self.cells, 1, axis=1)], axis=2), axis=2)
+        """Return every edge's vertices `(e, 2)` and the edge that each slit leaves, `(k, 3)`, with the seam joined."""
+        cells = self.joined_cells()
+        ends = np.sort(np.stack([cells, np.roll(cells, 1, axis=1)], axis=2), axis=2)
         pairs, which = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
         return pairs, np.asarray(which.reshape(-1, 3))
 
@@ -59,9 +61,28 @@ class Tiling:
         own = np.arange(len(self.cells))[:, None]
         return np.where(both[..., 0] == own, both[..., 1], both[..., 0])
 
+    def joined_cells(self) -> Index:
+        """Return the cells' vertices with the two sides of a seam made one, `(k, 3)`."""
+        return self.cells if self.twins is None else self.twins[self.cells]
+
     def part(self, keep: NDArray[np.bool_]) -> Tiling:
         """Return the tiling with only some of its cells; the vertices stay as they are."""
-        return Tiling(self.edge_mm, self.vertices_mm, self.cells[keep], self.inverted[keep])
+        return replace(self, cells=self.cells[keep], inverted=self.inverted[keep])
+
+    def compact(self) -> Tiling:
+        """Return the tiling without the vertices that no cell uses."""
+        used, cells = np.unique(self.cells, return_inverse=True)
+        twins = None
+        if self.twins is not None:
+            number = np.full(len(self.vertices_mm), -1)
+            number[used] = np.arange(len(used))
+            twins = number[self.twins[used]]
+            twins = np.where(twins < 0, np.arange(len(used)), twins)  # the other side is not in any cell
+        return replace(self, vertices_mm=self.vertices_mm[used], cells=cells.reshape(-1, 3), twins=twins)
+
+    def moved(self, by_mm: Array) -> Tiling:
+        """Return the tiling in another place."""
+        return replace(self, vertices_mm=self.vertices_mm + by_mm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +130,7 @@ def tile(flat_mm: Array, faces: Index, edge_mm: float, shift_mm: tuple[float, fl
     region = region_of(flat_mm, faces)
     centres = whole.centres_mm()
     kept = whole.part(shapely.contains_xy(region, centres[:, 0], centres[:, 1]))
-    kept = kept.part(_well_held(kept.cells, len(kept.vertices_mm)))
+    kept = kept.part(_well_held(kept.joined_cells(), len(kept.vertices_mm)))
     if not len(kept.cells):
         width, height = np.ptp(flat_mm, axis=0)
         raise DesignError(f"not one cell of {edge_mm:g} mm fits into a flat of {width:.1f} × {height:.1f} mm")

@@ -85,7 +85,7 @@ def _slit(path: CutPath, options: ToolOptions) -> list[CutPath]:
 def _shortened(path: CutPath, by_mm: float) -> Array:
     """Return the slit with `by_mm` taken off its inner ends, which the beam's own radius burns."""
     points = path.points_mm.copy()
-    for end in (0,) if path.is_half_slit() else (0, -1):
+    for end in (0,) if path.opens else (0, -1):
         other = 1 if end == 0 else -2
         arm = points[other] - points[end]
         length = float(np.linalg.norm(arm))

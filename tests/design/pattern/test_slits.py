@@ -66,7 +66,7 @@ def test_an_inner_edge_gets_one_polyline_and_a_border_edge_a_half_slit() -> None
     tiling = hexagon()
     paths = slit_paths(tiling, patterned(tiling))
     assert sorted(len(path.points_mm) for path in paths) == [2] * 6 + [3] * 6
-    assert [path.is_half_slit() for path in paths].count(True) == 6
+    assert [path.opens for path in paths].count(True) == 6
 
 
 def test_unequal_neighbours_meet_in_the_middle_of_their_shared_edge() -> None:

@@ -69,7 +69,7 @@ def test_a_slit_is_as_wide_and_as_long_as_drawn(width_mm: float) -> None:
 
 
 def test_a_half_slit_stays_open_at_the_border_and_keeps_its_hinge() -> None:
-    (stroke,) = strokes_of([CutPath("slit", np.array([[0.0, 0.0], [5.0, 0.0]]))], ToolOptions(KERF_mm))
+    (stroke,) = strokes_of([CutPath("slit", np.array([[0.0, 0.0], [5.0, 0.0]]), opens=True)], ToolOptions(KERF_mm))
     assert stroke.points_mm.tolist() == [[KERF_mm / 2, 0.0], [5.0, 0.0]]
 
 

@@ -1,0 +1,218 @@
+"""The design folder: written whole or not at all, and opened only as it was written.
+
+`manifest.json` holds the sha256 of every other file, so that a sheet is never cut from files that were edited after
+the check.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from design.deploy.indentation import response_csv
+from design.errors import BundleError
+from design.export.dxf import dxf
+from design.export.svg import svg
+from design.findings import Finding
+from design.meshfiles import write_ply
+from design.pattern.drawing import Drawing, as_json, from_json
+from design.pipeline import Design
+from design.preview import preview_png
+from design.surface import TriMesh
+
+FORMAT = 1
+ALWAYS = ("spec.yaml", "target.ply", "flat.ply", "cells.csv", "paths.json", "cut.dxf", "cut.svg", "cut.nc")
+ALSO = ("findings.json", "preview.png")
+PREDICTED = ("deployed.ply", "response.csv")
+LIBRARIES = ("fabctl", "numpy", "scipy", "shapely", "ezdxf")
+COLUMNS = ("cell", "cx_mm", "cy_mm", "inverted", "t_mm", "theta_deg", "expansion_ratio", "hinge_mm", "kind")
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """A design folder that was found whole and as it was written."""
+
+    path: Path
+    manifest: Mapping[str, Any]
+
+    def file(self, name: str) -> Path:
+        """Return one of the folder's files; raise `BundleError` where this design has none of that name."""
+        if name not in self.manifest["files"]:
+            raise BundleError(f"{self.path}: this design has no {name}")
+        return self.path / name
+
+    def drawing(self) -> Drawing:
+        """Return what is to be cut."""
+        return from_json(json.loads(self.file("paths.json").read_text(encoding="utf-8")))
+
+    def cells(self) -> list[dict[str, str]]:
+        """Return the rows of `cells.csv`."""
+        with self.file("cells.csv").open(encoding="utf-8", newline="") as stream:
+            return list(csv.DictReader(stream))
+
+
+def open_bundle(path: Path) -> Bundle:
+    """Return the design in a folder; raise `BundleError` with everything that is missing, edited or of another age."""
+    try:
+        manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
+        files = dict(manifest["files"])
+    except FileNotFoundError:
+        raise BundleError(f"{path}: no design here (manifest.json is missing)") from None
+    except (OSError, ValueError, KeyError, TypeError) as fault:
+        raise BundleError(f"{path}: manifest.json cannot be read: {fault}") from fault
+    if manifest.get("format") != FORMAT:
+        raise BundleError(f"{path}: a design of format {manifest.get('format')!r}; this program reads {FORMAT}")
+    found = [_fault(path / name, name, str(digest)) for name, digest in sorted(files.items())]
+    found += [Finding("BUNDLE-MISSING", "is not in the manifest", where=name) for name in ALWAYS if name not in files]
+    faults = [finding for finding in found if finding is not None]
+    if faults:
+        raise BundleError(f"{path}: not as it was built; build it again", faults)
+    return Bundle(path, manifest)
+
+
+def _fault(path: Path, name: str, digest: str) -> Finding | None:
+    try:
+        content = path.read_bytes()
+    except OSError as fault:
+        return Finding("BUNDLE-MISSING", f"cannot be read: {fault.strerror}", where=name)
+    if hashlib.sha256(content).hexdigest() != digest:
+        return Finding("BUNDLE-EDITED", "was changed after the build", where=name)
+    return None
+
+
+def write_bundle(design: Design, spec_text: str, path: Path, replace: bool = False) -> Bundle:
+    """Write the design folder and return it; what was not finished leaves nothing behind.
+
+    An existing folder is refused, unless it is empty, or `replace` is true and it holds a design.
+    """
+    if path.exists() and not _may_replace(path, replace):
+        raise BundleError(f"{path}: exists already; choose another folder, or say that a design there may be replaced")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    draft.mkdir()
+    try:
+        _write_files(design, spec_text, draft)
+        _write_manifest(design, draft)
+        if path.exists():
+            shutil.rmtree(path)
+        draft.rename(path)
+    except BaseException:
+        shutil.rmtree(draft, ignore_errors=True)
+        raise
+    return open_bundle(path)
+
+
+def _may_replace(path: Path, replace: bool) -> bool:
+    if not path.is_dir():
+        return False
+    return not any(path.iterdir()) or (replace and (path / "manifest.json").is_file())
+
+
+def _write_files(design: Design, spec_text: str, folder: Path) -> None:
+    drawing = design.drawing
+    texts = {
+        "spec.yaml": spec_text,
+        "cells.csv": cells_csv(design),
+        "paths.json": json.dumps(as_json(drawing), allow_nan=False) + "\n",
+        "cut.dxf": dxf(drawing.paths, drawing.size_mm),
+        "cut.svg": svg(drawing.paths, drawing.size_mm, design.spec.name),
+        "cut.nc": "\n".join(design.job.lines) + "\n",
+        "findings.json": json.dumps([finding.as_dict() for finding in design.findings], indent=1) + "\n",
+    }
+    if design.predicted is not None:
+        texts["response.csv"] = response_csv(design.predicted.response)
+        write_ply(folder / "deployed.ply", design.predicted.deployed.mesh)
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    flat = design.flattening
+    write_ply(folder / "target.ply", design.mesh)
+    write_ply(folder / "flat.ply", TriMesh(np.column_stack([flat.flat_mm, np.zeros(len(flat.flat_mm))]), flat.faces))
+    (folder / "preview.png").write_bytes(preview_png(design))
+
+
+def cells_csv(design: Design) -> str:
+    """Return one row a cell; lengths in mm on the sheet, the angle in degrees."""
+    cells = design.cells
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(COLUMNS)
+    for k, (x, y) in enumerate(cells.tiling.centres_mm().tolist()):
+        numbers = (
+            cells.choice.t_mm[k],
+            math.degrees(cells.choice.theta_rad[k]),
+            cells.choice.expansion_ratio[k],
+            cells.hinge_mm[k],
+        )
+        place = (f"{x:.6f}", f"{y:.6f}", int(cells.tiling.inverted[k]))
+        rows.writerow((k, *place, *(f"{number:.6f}" for number in numbers), cells.kind[k]))
+    return text.getvalue()
+
+
+def _write_manifest(design: Design, folder: Path) -> None:
+    files = {}
+    for path in sorted(folder.iterdir()):
+        files[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        _sync(path)
+    body = {
+        "format": FORMAT,
+        "name": design.spec.name,
+        "files": files,
+        "library": design.library_hash,
+        "versions": {name: _version(name) for name in LIBRARIES},
+        "facts": facts(design),
+    }
+    path = folder / "manifest.json"
+    path.write_text(json.dumps(body, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
+    _sync(path)
+    _sync(folder)
+
+
+def facts(design: Design) -> dict[str, Any]:
+    """Return the numbers that a summary shows, with their units."""
+    expansion = design.cells.choice.expansion_ratio
+    found: dict[str, Any] = {
+        "cells_count": len(expansion),
+        "expansion_low_ratio": float(expansion.min()),
+        "expansion_high_ratio": float(expansion.max()),
+        "sheet_mm": list(design.drawing.size_mm),
+        "cut_mm": design.job.cut_mm,
+        "travel_mm": design.job.travel_mm,
+        "cut_time_s": design.job.time_s,
+    }
+    if design.predicted is not None:
+        deviation = design.predicted.deployed.deviation
+        found |= {
+            "deviation_mean_mm": deviation.mean_mm,
+            "deviation_max_mm": deviation.max_mm,
+            "deviation_mean_frac": deviation.mean_frac,
+            "stiffness_2mm_N_mm": design.predicted.response.stiffness_N_mm(2.0),
+        }
+    return found
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

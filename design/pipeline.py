@@ -1,0 +1,168 @@
+"""A surface in, a sheet out: flatten, tile, average, choose cells, draw, compose, deploy. Pure; disk is `bundle`'s."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.cells.library import CellLibrary
+from design.cells.select import Choice, SelectionCurve, on_curve, select, selection_curve
+from design.cells.sheet import Sheet
+from design.errors import OutOfLibrary
+from design.findings import Finding
+from design.flatten import Flattening, flatten
+from design.job import Job, JobOptions, compose_job
+from design.pattern.assign import averaged, factor
+from design.pattern.border import framed
+from design.pattern.drawing import Drawing
+from design.pattern.paths import Layer, LayerPreset
+from design.pattern.slits import hinge_widths_mm, outline_loops, slit_paths, slits_of
+from design.pattern.tiling import Array, Place, Tiling, best_place, tile
+from design.predicted import Predicted, predict
+from design.spec import DesignSpec
+from design.surface import TriMesh
+
+SCALE_ROUNDS_COUNT = 12
+SCALE_MARGIN_RATIO = 2e-4  # kept from the end of the library, so that cells come to lie just inside it
+PUBLISHED_HIGH_RATIO = 1.75  # what the published pipeline scales the greatest expansion to
+
+Watch = Callable[[str, float], None]
+
+
+def unwatched(_: str, __: float) -> None:
+    """Hear nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """The tiling on the sheet and what each cell is, `(k,)` arrays."""
+
+    tiling: Tiling
+    wanted_ratio: Array
+    choice: Choice
+    hinge_mm: Array
+    kind: tuple[str, ...]  # cut, passive, monostable
+
+    def cut(self) -> NDArray[np.bool_]:
+        """Say which cells have slits."""
+        return np.array([kind != "passive" for kind in self.kind])
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """Everything a design folder holds, before it is written."""
+
+    spec: DesignSpec
+    sheet: Sheet
+    mesh: TriMesh
+    flattening: Flattening  # its flat lies on the sheet
+    cells: Cells
+    drawing: Drawing
+    job: Job
+    predicted: Predicted | None
+    findings: tuple[Finding, ...]
+    library_hash: str
+
+
+def build(
+    spec: DesignSpec,
+    mesh: TriMesh,
+    library: CellLibrary,
+    presets: Mapping[Layer, LayerPreset],
+    watch: Watch = unwatched,
+    findings: Iterable[Finding] = (),
+) -> Design:
+    """Return the design of `mesh`; raise a `DesignError` that carries the findings where there is none.
+
+    `library` must be that of the sheet to cut, with cells of `spec.cell_mm`; `presets` say how each layer is cut;
+    `findings` are those of reading the inputs.
+    """
+    watch("flattening the surface", 0.0)
+    flat = flatten(mesh, spec.flatten)
+    found = [*findings, *flat.findings]
+    watch("choosing cells", 0.2)
+    placed, tiling, wanted, choice = choose(spec, flat, library, found)
+    hinge = hinge_widths_mm(choice.expansion_ratio, spec.hinge)
+    watch("drawing slits", 0.4)
+    cells = Cells(tiling, wanted, choice, hinge, tuple("cut" for _ in wanted))
+    drawing, shift = draw(spec, cells, library.sheet)
+    cells = replace(cells, tiling=tiling.moved(shift))
+    placed = replace(placed, flat_mm=placed.flat_mm + shift)
+    watch("ordering the cut", 0.5)
+    job = compose_job(drawing, presets, JobOptions(tool=spec.tool, spread_mm=spec.spread_mm), remarks=[spec.name])
+    predicted = None
+    if spec.response is not None:
+        watch("deploying the sheet", 0.6)
+        predicted = predict(placed, cells.tiling, choice, library, spec.response, watch)
+        found += predicted.findings
+    return Design(spec, library.sheet, mesh, placed, cells, drawing, job, predicted, tuple(found), library.hash)
+
+
+def choose(
+    spec: DesignSpec, flat: Flattening, library: CellLibrary, found: list[Finding]
+) -> tuple[Flattening, Tiling, Array, Choice]:
+    """Return the flat in its final scale and place, its cells, what they must expand by, and the cells chosen."""
+    if spec.selection.rule == "published":
+        tiling = tile(flat.flat_mm, flat.faces, spec.cell_mm).compact()
+        wanted = averaged(tiling, flat.flat_mm, flat.faces, flat.expansion_ratio**2, spec.averaging)
+        wanted *= PUBLISHED_HIGH_RATIO / wanted.max()
+        choice = select(library, wanted, spec.selection)
+        found.append(
+            Finding("SCALE-PUBLISHED", "the flat was not scaled with the expansions, as published", "warning",
+                    hint="the deployed sheet has not the target's size; take another selection rule for that")
+        )  # fmt: skip
+        return flat, tiling, wanted, choice
+    curve = selection_curve(library, spec.selection)
+    flat, tiling, wanted = scaled(spec, flat, curve, found)
+    return flat, tiling, wanted, on_curve(curve, wanted)
+
+
+def scaled(
+    spec: DesignSpec, flat: Flattening, curve: SelectionCurve, found: list[Finding]
+) -> tuple[Flattening, Tiling, Array]:
+    """Return the flat scaled so that the cells' expansions lie where the specification wants them in the library.
+
+    Expansions depend on where cells fall, and that on the scale: repeated until the end of the range is met. Raises
+    `OutOfLibrary` where the cells ask for a greater spread than the library has.
+    """
+    low, high = curve.range_ratio()
+    room = (low * (1 + SCALE_MARGIN_RATIO), high * (1 - SCALE_MARGIN_RATIO))
+    first = _faces_range(flat)
+    if first[1] / first[0] > high / low:
+        raise OutOfLibrary(*first, (low, high), found)
+    flat = flat.scaled(1 / factor(*first, room, spec.scale))
+    place = Place()
+    if spec.placement == "optimised":
+        place, misfit = best_place(flat.flat_mm, flat.faces, spec.cell_mm)
+        found.append(Finding("TILE-FIT", f"flat and cells differ on {misfit:.1%} of the flat's area", "info"))
+    flat = replace(flat, flat_mm=place.put(flat.flat_mm))
+    for _ in range(SCALE_ROUNDS_COUNT):
+        tiling = tile(flat.flat_mm, flat.faces, spec.cell_mm, place.shift_mm)
+        wanted = averaged(tiling, flat.flat_mm, flat.faces, flat.expansion_ratio**2, spec.averaging)
+        change = factor(float(wanted.min()), float(wanted.max()), room, spec.scale)
+        if abs(change - 1) < SCALE_MARGIN_RATIO or wanted.max() / wanted.min() > high / low:
+            break
+        flat = flat.scaled(1 / change)
+    if wanted.min() < low or wanted.max() > high:
+        raise OutOfLibrary(float(wanted.min()), float(wanted.max()), (low, high), found)
+    return flat, tiling.compact(), wanted
+
+
+def _faces_range(flat: Flattening) -> tuple[float, float]:
+    """Return the expansions between which all but the outermost hundredth of the area lies, as a first guess."""
+    order = np.argsort(flat.expansion_ratio)
+    area = np.cumsum(flat.mesh.face_areas_mm2()[order])
+    first, last = np.searchsorted(area, [0.01 * area[-1], 0.99 * area[-1]])
+    return float(flat.expansion_ratio[order[first]]), float(flat.expansion_ratio[order[min(last, len(order) - 1)]])
+
+
+def draw(spec: DesignSpec, cells: Cells, sheet: Sheet) -> tuple[Drawing, Array]:
+    """Return the drawing of the cells with everything around them, and by how much it moved them."""
+    tiling, choice, cut = cells.tiling, cells.choice, cells.cut()
+    slits = slits_of(tiling, choice.t_mm, choice.theta_rad, cells.hinge_mm, sheet.slit_mm, cut)
+    paths = slit_paths(tiling, slits, cut)
+    mouths = np.array([path.points_mm[-1] for path in paths if path.opens]).reshape(-1, 2)
+    return framed(outline_loops(tiling), mouths, paths, spec.border, spec.cell_mm)

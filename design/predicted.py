@@ -1,0 +1,94 @@
+"""What the sheet will do: its deployed shape beside the target, and the force of an indenter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from design.cells.library import CellLibrary
+from design.cells.select import Choice
+from design.deploy.indentation import Response, indentation_response
+from design.deploy.levels import Layout, sheet_layout
+from design.deploy.predict import Deployed, deploy
+from design.findings import Finding
+from design.flatten import Flattening
+from design.pattern.tiling import Array, Tiling
+from design.spec import ResponseOptions
+
+# Bending stiffness over that of the uncut sheet along the stiffest-cell curve, computed with prestress on the deployed
+# two-unit cell in three dimensions; it hardly depends on how the curve is chosen.
+BENDING_AT_RATIO = np.array([1.16, 1.20, 1.30, 1.40, 1.50, 1.60, 1.70, 1.77])
+BENDING_RATIO = np.array([0.084, 0.095, 0.106, 0.100, 0.093, 0.084, 0.073, 0.061])
+
+
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """The deployed shape in the target's frame and the indentation response."""
+
+    deployed: Deployed
+    response: Response
+    findings: tuple[Finding, ...]
+
+
+def predict(
+    flat: Flattening,
+    tiling: Tiling,
+    choice: Choice,
+    library: CellLibrary,
+    options: ResponseOptions,
+    watch: Callable[[str, float], None],
+) -> Predicted:
+    """Return what the shell model says of the cells on their sheet. Raises `NotConverged` where it finds no shape."""
+    layout = layout_of(tiling, choice, library)
+    deployed = deploy(layout, flat.mesh, lifted(flat, tiling.vertices_mm))
+    watch("pressing the indenter", 0.8)
+    response = indentation_response(
+        layout,
+        deployed.mesh.vertices_mm,
+        options.indenter_radius_mm,
+        options.depth_mm,
+        options.steps_count,
+        None if options.point_mm is None else np.array(options.point_mm),
+        watch=lambda share: watch("pressing the indenter", 0.8 + 0.2 * share),
+    )
+    return Predicted(deployed, response, ())
+
+
+def layout_of(tiling: Tiling, choice: Choice, library: CellLibrary) -> Layout:
+    """Return the shell's units: the tiling's cells, counter-clockwise, with their stiffness."""
+    sheet = library.sheet
+    cells = np.where(tiling.inverted[:, None], tiling.cells[:, ::-1], tiling.cells)
+    at = library.at(choice.t_mm, choice.theta_rad)
+    # At the very rim of the map Poisson's ratio cannot be interpolated: the nearest cell's is as good.
+    nu = np.where(np.isfinite(at.nu_tangent_ratio), at.nu_tangent_ratio, _nearest_nu(choice, library))
+    flat_mm2 = 6 * np.sqrt(3) / 4 * sheet.edge_mm**2
+    solid_mJ = sheet.E_MPa * sheet.thickness_mm**3 / 12
+    bending = solid_mJ * np.interp(choice.expansion_ratio, BENDING_AT_RATIO, BENDING_RATIO)
+    return sheet_layout(tiling.vertices_mm, cells, choice.expansion_ratio, choice.stiffness_mJ / flat_mm2, nu, bending)
+
+
+def _nearest_nu(choice: Choice, library: CellLibrary) -> Array:
+    from scipy.spatial import cKDTree
+
+    edge = library.sheet.edge_mm
+    tree = cKDTree(np.column_stack([library.t_mm, edge * library.theta_rad]))
+    _, at = tree.query(np.column_stack([choice.t_mm, edge * choice.theta_rad]))
+    return np.asarray(library.nu_tangent_ratio[at])
+
+
+def lifted(flat: Flattening, points_mm: Array) -> Array:
+    """Return where points of the flat lie on the target, `(n, 3)`; beyond its border the nearest face goes on."""
+    corners = flat.flat_mm[flat.faces]
+    tree = shapely.STRtree(np.asarray(shapely.polygons(corners)))
+    which, face = tree.query_nearest(np.asarray(shapely.points(points_mm)), all_matches=False)
+    face = face[np.argsort(which)]
+    a, b, c = corners[face].transpose(1, 0, 2)
+    u, v, w = b - a, c - a, points_mm - a
+    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    second = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
+    third = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
+    weights = np.column_stack([1 - second - third, second, third])
+    return np.asarray(np.einsum("nk,nkd->nd", weights, flat.mesh.vertices_mm[flat.mesh.faces[face]]))

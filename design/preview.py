@@ -1,0 +1,75 @@
+"""One picture of a design: the sheet as it is cut, its cells coloured by what they expand by."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+
+from design.export.svg import COLOURS
+from design.pattern.paths import LAYERS, CutPath
+from design.pattern.tiling import Array
+from design.pipeline import Design
+
+WIDTH_INCHES, DPI = 10.0, 150
+
+
+def preview_png(design: Design) -> bytes:
+    """Return a PNG of the sheet with its expansions and, where predicted, of the deployed shape and the response."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    width, height = design.drawing.size_mm
+    aspect = min(2.5, max(0.6, height / width))
+    predicted = design.predicted is not None
+    figure = Figure(figsize=(WIDTH_INCHES * (1.5 if predicted else 1.0), WIDTH_INCHES * aspect), layout="constrained")
+    FigureCanvasAgg(figure)
+    if predicted:
+        grid = figure.add_gridspec(2, 2, width_ratios=[2, 1])
+        _draw_sheet(figure, figure.add_subplot(grid[:, 0]), design)
+        _draw_deployed(figure.add_subplot(grid[0, 1], projection="3d"), design)
+        _draw_response(figure.add_subplot(grid[1, 1]), design)
+    else:
+        _draw_sheet(figure, figure.add_subplot(), design)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
+    return file.getvalue()
+
+
+def _draw_sheet(figure: Any, axes: Any, design: Design) -> None:
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    cells, drawing = design.cells, design.drawing
+    corners = cells.tiling.vertices_mm[cells.tiling.cells]
+    faces = PolyCollection(list(corners), array=cells.choice.expansion_ratio, cmap="viridis", alpha=0.45, linewidths=0)
+    axes.add_collection(faces)
+    for layer in LAYERS:
+        lines = [_closed(path) for path in drawing.paths if path.layer == layer]
+        axes.add_collection(LineCollection(lines, colors=COLOURS[layer], linewidths=0.9 if layer == "outline" else 0.6))
+    width, height = drawing.size_mm
+    axes.set(xlim=(0, width), ylim=(0, height), xlabel="x, mm", ylabel="y, mm", aspect="equal")
+    axes.set_title(f"{design.spec.name}: {len(corners)} cells on {width:.0f} × {height:.0f} mm")
+    figure.colorbar(faces, ax=axes, label="expansion, deployed over flat length", shrink=0.6)
+
+
+def _closed(path: CutPath) -> Array:
+    return np.vstack([path.points_mm, path.points_mm[:1]]) if path.closed else path.points_mm
+
+
+def _draw_deployed(axes: Any, design: Design) -> None:
+    assert design.predicted is not None
+    deployed = design.predicted.deployed
+    x, y, z = deployed.mesh.vertices_mm.T
+    axes.plot_trisurf(x, y, z, triangles=deployed.mesh.faces, color="#d0b060", edgecolor="#80602080", linewidth=0.2)
+    axes.set_aspect("equal")
+    axes.set_title(f"deployed: {deployed.deviation.mean_mm:.2f} mm from the target on average", fontsize=9)
+
+
+def _draw_response(axes: Any, design: Design) -> None:
+    assert design.predicted is not None
+    response = design.predicted.response
+    axes.plot(response.depth_mm, response.load_N, label="in")
+    axes.plot(response.depth_mm, response.unload_N, "--", label="out")
+    axes.set(xlabel="depth, mm", ylabel="force, N", title="indentation, predicted")
+    axes.legend()

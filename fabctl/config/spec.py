@@ -1,0 +1,182 @@
+"""The specification file: what is asked of a design, with the target and the material by name."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from design.cells.select import Rule, SelectionOptions
+from design.flatten import FlattenOptions
+from design.flatten.result import Boundary, SeamChoice
+from design.pattern.assign import Averaging, ScaleOptions, Which
+from design.pattern.border import BorderOptions
+from design.pattern.slits import HingeOptions, HingeRule
+from design.pattern.tiling import Placement
+from design.pattern.toolpath import Sides, ToolOptions
+from design.spec import DesignSpec, Infeasible, Region, ResponseOptions
+from fabctl.config.bench import Positive, find
+from fabctl.config.loader import Model, load
+
+Length = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, lt=1)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class MadeTarget(Model):
+    """One of the project's own surfaces, with its measures (`fabctl target make --help` lists them)."""
+
+    make: str
+    radius_mm: Positive | None = None
+    height_mm: Positive | None = None
+    half_angle_deg: Positive | None = None
+    edge_mm: Positive | None = None
+
+    def arguments(self) -> dict[str, float]:
+        """Return the measures that were given, angles in radians."""
+        given = {"radius_mm": self.radius_mm, "height_mm": self.height_mm, "edge_mm": self.edge_mm}
+        if self.half_angle_deg is not None:
+            given["half_angle_rad"] = math.radians(self.half_angle_deg)
+        return {name: value for name, value in given.items() if value is not None}
+
+
+class FlattenConfig(Model):
+    """How the surface is laid flat."""
+
+    boundary: Boundary = "isometric"
+    modes_count: Count = 24
+    seam: SeamChoice = "auto"
+    cones_count: Count = 0
+
+    @model_validator(mode="after")
+    def _no_values_here(self) -> FlattenConfig:
+        if self.boundary == "prescribed":
+            raise ValueError("a prescribed boundary needs values per vertex; it is for programs, not for this file")
+        return self
+
+
+class ScaleConfig(Model):
+    """Which end of the library's expansions the design takes."""
+
+    end: Which = "high"
+    high_ratio: Positive | None = None
+
+    @model_validator(mode="after")
+    def _value_given(self) -> ScaleConfig:
+        if (self.end == "value") != (self.high_ratio is not None):
+            raise ValueError("`high_ratio` belongs to `end: value`, and to nothing else")
+        return self
+
+
+class SelectionConfig(Model):
+    """How a cell is chosen for its expansion."""
+
+    rule: Rule = "smooth"
+    max_stiffness_loss_frac: Share = 0.05
+    barrier_floor_mJ: Length = 0.0
+
+
+class HingeConfig(Model):
+    """How wide hinges are; without a width, the library's own, so that its predictions hold."""
+
+    rule: HingeRule = "constant"
+    width_mm: Positive | None = None
+    added_mm: Length = 0.125
+
+
+class RegionConfig(Model):
+    """A circle on the sheet whose cells are treated in their own way."""
+
+    kind: Literal["passive", "monostable"]
+    x_mm: float
+    y_mm: float
+    radius_mm: Positive
+
+
+class BorderConfig(Model):
+    """What is added around the cells."""
+
+    margin_mm: Length = 0.0
+    marks: bool = True
+    mark_mm: Positive = 4.0
+    sheet_margin_mm: Length = 10.0
+    id_height_mm: Length = 3.0
+    id_width_mm: Positive = 16.0
+    code_module_mm: Length = 0.8
+
+
+class ToolConfig(Model):
+    """How the beam goes about it; the kerf is the material's unless it is given here."""
+
+    kerf_mm: Positive | None = None
+    slit_width_mm: Positive | None = None
+    slit_sides: Sides = "auto"
+    lead_in_mm: Length = 1.0
+    overcut_mm: Length = 0.3
+    tabs_count: Count = 0
+    tab_mm: Positive = 0.4
+    spread_mm: Length = 0.0
+
+
+class ResponseConfig(Model):
+    """The indentation to predict."""
+
+    indenter_radius_mm: Positive = 8.0
+    depth_mm: Positive = 6.0
+    steps_count: Annotated[int, Field(ge=4, le=400)] = 16
+    point_mm: tuple[float, float, float] | None = None
+
+
+class SpecConfig(Model):
+    """One design, asked for. `target` is a mesh file (relative to this file), or one of the project's own surfaces."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    target: str | MadeTarget
+    material: str = "natural-rubber-2.3"
+    cell_mm: Positive | None = None
+    library: str | None = None
+    flatten: FlattenConfig = FlattenConfig()
+    infeasible: Infeasible = "report"
+    averaging: Averaging = "exact"
+    scale: ScaleConfig = ScaleConfig()
+    selection: SelectionConfig = SelectionConfig()
+    placement: Placement = "optimised"
+    hinge: HingeConfig = HingeConfig()
+    regions: tuple[RegionConfig, ...] = ()
+    border: BorderConfig = BorderConfig()
+    tool: ToolConfig = ToolConfig()
+    bed_mm: tuple[Positive, Positive] | None = None
+    response: ResponseConfig | None = ResponseConfig()
+
+    def to_design(self, cell_mm: float, hinge_mm: float, kerf_mm: float) -> DesignSpec:
+        """Return the specification as the design package knows it; what the file leaves open comes from the material.
+
+        `hinge_mm` belongs to cells of `cell_mm`.
+        """
+        tool: dict[str, Any] = self.tool.model_dump(exclude={"kerf_mm", "spread_mm"})
+        hinge = self.hinge.width_mm if self.hinge.width_mm is not None else hinge_mm
+        return DesignSpec(
+            name=self.name,
+            cell_mm=cell_mm,
+            flatten=FlattenOptions(**self.flatten.model_dump()),
+            infeasible=self.infeasible,
+            averaging=self.averaging,
+            scale=ScaleOptions(self.scale.end, self.scale.high_ratio),
+            selection=SelectionOptions(**self.selection.model_dump()),
+            placement=self.placement,
+            hinge=HingeOptions(self.hinge.rule, hinge, self.hinge.added_mm),
+            regions=tuple(Region(**region.model_dump()) for region in self.regions),
+            border=BorderOptions(**self.border.model_dump()),
+            tool=ToolOptions(kerf_mm=self.tool.kerf_mm or kerf_mm, **tool),
+            spread_mm=self.tool.spread_mm,
+            bed_mm=self.bed_mm,
+            response=ResponseOptions(**self.response.model_dump()) if self.response else None,
+        )
+
+
+def load_spec(name: str, home: Path) -> tuple[SpecConfig, Path]:
+    """Return the specification called `name` (a path, or a name in `configs/specs`) and the file it came from."""
+    path = find("specs", name, home)
+    return load(path, SpecConfig), path

@@ -1,0 +1,128 @@
+"""From a specification file to a design folder: what the command line and the whole flow both do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from design.bundle import Bundle, write_bundle
+from design.cells.library import CellLibrary, load_library
+from design.cells.sheet import Sheet
+from design.findings import Finding
+from design.meshfiles import read_mesh
+from design.pattern.paths import Layer, LayerPreset
+from design.pipeline import Design, build
+from design.spec import DesignSpec
+from design.surface import TriMesh
+from design.targets import TARGETS
+from fabctl.config.material import LayerConfig, MaterialConfig, load_material
+from fabctl.config.spec import MadeTarget, SpecConfig, load_spec
+from fabctl.errors import RefusedError, UsageError
+from fabctl.events import Emit, Event, silent
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Everything a design is made from, read and checked."""
+
+    spec: DesignSpec
+    text: str
+    mesh: TriMesh
+    library: CellLibrary
+    presets: dict[Layer, LayerPreset]
+    findings: tuple[Finding, ...]
+
+
+def read_inputs(name: str, home: Path, target: Path | None = None, cell_mm: float | None = None) -> Inputs:
+    """Return the inputs of the specification called `name`; `target` and `cell_mm` take the place of the file's.
+
+    Raises `ConfigError`, `UsageError`, `MeshError` or `RefusedError`, each with all that is wrong.
+    """
+    config, path = load_spec(name, home)
+    material = load_material(config.material, home)
+    edge_mm = cell_mm or config.cell_mm or material.edge_mm
+    sheet = sheet_of(material, edge_mm)
+    presets = presets_of(material)
+    assert material.laser is not None  # presets_of has refused otherwise
+    spec = config.to_design(edge_mm, sheet.hinge_mm, material.laser.kerf_mm)
+    mesh, findings = read_target(config, path, target)
+    library = load_library(Path(config.library) if config.library else None).scaled(sheet)
+    return Inputs(spec, path.read_text(encoding="utf-8"), mesh, library, presets, tuple(findings))
+
+
+def design_of(inputs: Inputs, emit: Emit = silent) -> Design:
+    """Return the design of the inputs."""
+
+    def watch(message: str, done_frac: float) -> None:
+        emit(Event("progress", message, done_frac))
+
+    return build(inputs.spec, inputs.mesh, inputs.library, inputs.presets, watch, inputs.findings)
+
+
+def build_folder(
+    name: str,
+    folder: Path,
+    home: Path,
+    target: Path | None = None,
+    cell_mm: float | None = None,
+    replace: bool = False,
+    emit: Emit = silent,
+) -> tuple[Design, Bundle]:
+    """Build the specification called `name` into `folder`; return the design and its folder."""
+    inputs = read_inputs(name, home, target, cell_mm)
+    design = design_of(inputs, emit)
+    emit(Event("progress", "writing the design folder", 0.99))
+    return design, write_bundle(design, inputs.text, folder, replace)
+
+
+def read_target(config: SpecConfig, path: Path, target: Path | None) -> tuple[TriMesh, list[Finding]]:
+    """Return the surface that a specification names; a file is looked for beside the specification first."""
+    if target is not None:
+        return read_mesh(target)
+    if isinstance(config.target, MadeTarget):
+        return made(config.target), []
+    beside = path.parent / config.target
+    return read_mesh(beside if beside.is_file() else Path(config.target))
+
+
+def made(asked: MadeTarget) -> TriMesh:
+    """Return one of the project's own surfaces; raise `UsageError` where there is none, or it has no such measure."""
+    if asked.make not in TARGETS:
+        raise UsageError(f"there is no target {asked.make!r} (known: {', '.join(sorted(TARGETS))})")
+    try:
+        return TARGETS[asked.make](**asked.arguments())
+    except TypeError as fault:
+        raise UsageError(f"the target {asked.make!r} has no such measure: {fault}") from fault
+
+
+def sheet_of(material: MaterialConfig, edge_mm: float) -> Sheet:
+    """Return the sheet with cells of `edge_mm`; slit and hinge grow and shrink with the cell, as the library needs."""
+    ratio = edge_mm / material.edge_mm
+    return Sheet(
+        edge_mm=edge_mm,
+        slit_mm=ratio * material.slit_mm,
+        hinge_mm=ratio * material.hinge_mm,
+        thickness_mm=material.thickness_mm,
+        E_MPa=material.E_MPa,
+        nu_ratio=material.nu_ratio,
+        density_kg_m3=material.density_kg_m3,
+    )
+
+
+def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
+    """Return how each layer is cut; raise `RefusedError` for a material that must not, or cannot yet, be cut."""
+    if material.never_cut_because:
+        danger = Finding("MATERIAL-NEVER", material.never_cut_because, where=material.name)
+        raise RefusedError(f"{material.name} must not be cut", [danger])
+    if material.laser is None:
+        missing = Finding("MATERIAL-LASER", "has no laser preset", where=material.name, hint="cut a power-speed grid")
+        raise RefusedError(f"{material.name} cannot be cut yet", [missing])
+    laser = material.laser
+    layers: dict[Layer, LayerConfig] = {
+        "engrave": laser.engrave,
+        "mark": laser.mark,
+        "hole": laser.outline,
+        "slit": laser.slit,
+        "outline": laser.outline,
+    }
+    return {layer: LayerPreset(c.power_frac, c.feed_mm_s, c.passes_count) for layer, c in layers.items()}
