@@ -27,6 +27,7 @@ MISFIT_SIGMA = 4.0  # a window is too long where chi² exceeds its mean by so ma
 AGREE_SIGMA = 1.5  # and where its contact lies outside so many standard errors of a shorter window's
 DRIFT_N_MM = 2e-3  # how much the free part is expected to slope: drift over speed
 WINDOWS = (0.15, 0.25, 0.4, 0.6, 0.85)  # of the way from the guess to the first maximum
+ENOUGH_COUNT, THIN_MM = 350, 0.02  # more samples than this are averaged over at most so much of the stroke
 SE_GOOD_MM = 0.05  # a shorter window this sure may end the search; a less sure one is lengthened in any case
 SE_MAX_MM = 0.25  # a contact less certain than this is not found
 
@@ -72,11 +73,11 @@ class Fit:
 
 def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
     """Return the contact on a loading curve; `position_mm` (n,) rises, the frame's give already taken off."""
-    guess = _guess(position_mm, force_N)
+    u, f = _thinned(position_mm, force_N)
+    guess = _guess(u, f)
     if isinstance(guess, str):
         return Contact(None, guess)
     start, level_N, noise_N = guess
-    u, f = position_mm, force_N
     others = _opinions(u, f, start, level_N, noise_N)
     best = _best_fit(u, f, start, noise_N)
     if best is None:
@@ -101,13 +102,24 @@ def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
     return found
 
 
+def _thinned(u: Reals, f: Reals) -> tuple[Reals, Reals]:
+    """Return means of neighbouring samples where they lie closer than is of use; the fits cost by the sample."""
+    spacing = float(np.median(np.abs(np.diff(u)))) if len(u) > 1 else 1.0
+    many = min(len(u) // ENOUGH_COUNT, int(THIN_MM / max(spacing, 1e-6)))
+    if many < 2:
+        return u, f
+    kept = len(u) // many * many
+    return u[:kept].reshape(-1, many).mean(axis=1), f[:kept].reshape(-1, many).mean(axis=1)
+
+
 def _guess(u: Reals, f: Reals) -> tuple[int, float, float] | str:
     """Return (index of the first sure rise, free level, noise), or why there is none."""
     if len(u) < 3 * FREE_MIN:
         return f"only {len(u)} samples in the loading"
     head = f[:FREE_MIN]
     noise = max(float(np.std(np.diff(head)) / np.sqrt(2)), 1e-6)
-    if f.max() - np.median(head) < SIGNAL * noise:
+    top = float(np.convolve(f, np.full(8, 1 / 8), "valid").max())
+    if top - np.median(head) < SIGNAL * noise / np.sqrt(8):
         return f"the force never leaves the noise of {1000 * noise:.1f} mN"
     # The free part grows as long as the running mean of a few samples stays in its band.
     width = 8

@@ -9,7 +9,9 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
+
+import numpy as np
 
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.rig.indenter import LOST, Indenter, Limits, RigFaulted, ended
@@ -18,12 +20,23 @@ from fabctl.clock import Clock
 from fabctl.config.method import MethodConfig
 from fabctl.errors import FabctlError, Stopped
 from fabctl.events import Emit, Event, silent
+from fabctl.indent.contact import find_contact
 from fabctl.indent.method import Action, time_s
-from fabctl.indent.recorder import Recorder, Row
+from fabctl.indent.recorder import Row
 
 Wish = Literal["go", "pause", "stop"]
 SHOWN_HZ = 12.0
 HOMING_MM_S = 8.0
+FREE_S, FREE_SIGMA, FREE_N = 0.25, 4.0, 2e-3
+MORE_ROOM_COUNT = 6
+
+
+class Keeper(Protocol):
+    """What takes the rows; `Recorder` makes them durable."""
+
+    def take(self, row: Row) -> None:
+        """Take one row."""
+        ...
 
 
 class NoContact(FabctlError):
@@ -63,7 +76,7 @@ class Runner:
         rig: Indenter,
         method: MethodConfig,
         plan: Sequence[Action],
-        recorder: Recorder,
+        recorder: Keeper,
         clock: Clock,
         sample_hz: float,
         emit: Emit = silent,
@@ -78,6 +91,7 @@ class Runner:
         self._tare_N = 0.0
         self._zero_mm: float | None = None
         self._clear_mm = 0.0
+        self._trace: list[tuple[float, float]] = []
         self._next_s = clock.now_s()
         self._last_good_s = clock.now_s()
         self._shown_s = 0.0
@@ -178,13 +192,39 @@ class Runner:
         here_mm = self._fresh().position_mm
         end_mm = self.method.limits.travel_mm if action.travel_mm is None else here_mm + action.travel_mm
         end_mm = min(end_mm, self.method.limits.travel_mm)
+        self._trace.clear()
         found = self._drive(end_mm, action.speed_mm_s, above_N=self._tare_N + trigger_N)
         if found.reason == "limit_not_reached":
             raise NoContact(trigger_N, found.position_mm)
-        self._zero_mm = found.position_mm
-        self._clear_mm = max(0.0, found.position_mm - action.clearance_mm)
-        self.ending.contacts_mm[action.point] = found.position_mm
+        self._zero_mm = self._touched(found.position_mm)
+        self._clear_mm = max(0.0, self._zero_mm - action.clearance_mm)
+        self.ending.contacts_mm[action.point] = self._zero_mm
         self._drive(self._clear_mm, action.speed_mm_s)
+        self._make_free(action)
+
+    def _touched(self, triggered_mm: float) -> float:
+        """Return where contact began: a soft specimen is millimetres deep before the trigger's force is there."""
+        position = np.array([place for place, _ in self._trace])
+        force = np.array([force for _, force in self._trace])
+        forward = np.flatnonzero(np.diff(position, prepend=position[:1] - 1.0) > 0)
+        found = find_contact(position[forward], force[forward]).position_mm
+        return triggered_mm if found is None else min(found, triggered_mm)
+
+    def _make_free(self, action: Action) -> None:
+        """Rise until the force is that of the tare: every curve must begin free."""
+        for _ in range(MORE_ROOM_COUNT):
+            until_s = self.clock.now_s() + FREE_S
+            forces = []
+            while self.clock.now_s() < until_s:
+                forces.append(self._fresh().force_N - self._tare_N)
+            if statistics.fmean(forces) < FREE_SIGMA * statistics.pstdev(forces) / len(forces) ** 0.5 + FREE_N:
+                return
+            self._clear_mm = max(0.0, self._clear_mm - action.clearance_mm)
+            self._drive(self._clear_mm, action.speed_mm_s)
+        raise ForceOffZero(
+            f"after the approach the force stays {statistics.fmean(forces):.3f} N above the tare, "
+            f"{MORE_ROOM_COUNT} times the clearance above contact; does the specimen stick, or the cell drift?"
+        )
 
     def _drive_to(self, action: Action) -> None:
         """Go to the depth or force an action names."""
@@ -300,6 +340,8 @@ class Runner:
             )
         )
         self.ending.rows_count += 1
+        if action.kind == "approach":
+            self._trace.append((sample.position_mm, sample.force_N - self._tare_N))
         if now_s - self._shown_s >= 1 / SHOWN_HZ:
             self._shown_s = now_s
             self._show(sample, now_s)
