@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,34 @@ class FeasibilityReport:
         """Return the flat to build with: of the first rung that fits, else of the one that spreads least."""
         step = self.best() or min(self.steps, key=lambda step: step.spread_ratio)
         return step.flattening
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain JSON, without the arrays."""
+        steps = [
+            {"rung": step.rung, "spread_ratio": step.spread_ratio, "fits": step.fits, "detail": step.detail}
+            for step in self.steps
+        ]
+        return {
+            "limits_ratio": [self.limits.low_ratio, self.limits.high_ratio],
+            "fits": self.best() is not None,
+            "steps": steps,
+            "bound_ratio": self.bound_ratio,
+            "proven_infeasible": self.proven_infeasible,
+            "outside_faces_count": int(np.count_nonzero(self.excess_log)),
+            "nearest_rms_mm": self.nearest.rms_mm if self.nearest else None,
+            "nearest_rms_ratio": self.nearest.rms_ratio if self.nearest else None,
+            "findings": [finding.as_dict() for finding in self.findings],
+        }
+
+    def colors(self, mesh: TriMesh) -> NDArray[np.uint8]:
+        """Return a colour per vertex, `(n, 3)`: grey fits, red asks for too much expansion, blue for too little."""
+        worst = max(float(np.abs(self.excess_log).max()), 1e-12)
+        total = np.bincount(mesh.faces.ravel(), np.repeat(self.excess_log, 3), len(mesh.vertices_mm))
+        excess = total / np.maximum(np.bincount(mesh.faces.ravel(), minlength=len(total)), 1) / worst
+        # Whatever lies outside at all is to be seen, so colour begins a third of the way.
+        depth = np.where(excess == 0, 0, np.sign(excess) * (0.35 + 0.65 * np.abs(excess).clip(0, 1)))[:, None]
+        ends = np.where(depth > 0, [200.0, 30, 40], [40.0, 80, 200])
+        return np.asarray(190 + (ends - 190) * np.abs(depth), dtype=np.uint8)
 
 
 def feasibility(

@@ -8,7 +8,7 @@ from typing import Any
 import igl
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, csr_array, triu
 from scipy.sparse.linalg import splu
 
 from design.errors import FlattenError
@@ -80,21 +80,25 @@ PARDISO_FROM = 30_000  # unknowns; below it SuperLU is as fast and always there
 
 
 class _Pardiso:
-    def __init__(self, A: csc_array, solver: Any) -> None:
-        self._A, self._solver = A.tocsr(), solver
+    def __init__(self, upper: csr_array, solver: Any) -> None:
+        self._upper, self._solver = upper, solver
 
     def solve(self, right: Values) -> Values:
-        return np.asarray(self._solver.solve(self._A, right))
+        return np.asarray(self._solver.solve(self._upper, right))
 
 
 def _pardiso(A: csc_array) -> _Pardiso | None:
     try:
-        from pypardiso import PyPardisoSolver
+        from pypardiso import PyPardisoError, PyPardisoSolver
     except ImportError:  # the optional extra `pardiso`
         return None
-    solver = PyPardisoSolver()
-    solver.factorize(A.tocsr())
-    return _Pardiso(A, solver)
+    solver = PyPardisoSolver(mtype=2)  # symmetric positive definite, given by its upper triangle
+    upper = csr_array(triu(A, format="csr"))
+    try:
+        solver.factorize(upper)
+    except PyPardisoError:  # rounding made a nearly singular matrix indefinite; SuperLU is more patient
+        return None
+    return _Pardiso(upper, solver)
 
 
 def angle_defects(mesh: TriMesh, border: Indices) -> Values:

@@ -102,6 +102,20 @@ class Flattening:
             seams=seams,
         )
 
+    def unrolled(self) -> tuple[Points, Faces, Indices]:
+        """Return a tube's flat three times side by side: points, faces, and which face each is a copy of.
+
+        Whatever lies in one period around the middle copy is covered, wherever the seam runs; so a pattern may choose
+        its own straight joint, and cells on it still lie on faces. Without a tube's seam it is the flat itself.
+        """
+        seam = next((seam for seam in self.seams if seam.closes_tube), None)
+        if seam is None:
+            return self.flat_mm, self.faces, np.arange(len(self.faces))
+        shifts = [np.multiply(seam.translation_mm, step) for step in (-1, 0, 1)]
+        points_mm = np.vstack([self.flat_mm + shift for shift in shifts])
+        faces = np.vstack([self.faces + step * len(self.flat_mm) for step in range(3)])
+        return points_mm, faces, np.tile(np.arange(len(self.faces)), 3)
+
     def whole_cell_scales(self, cell_mm: float, low_ratio: float, high_ratio: float) -> list[tuple[int, float]]:
         """Return `(cells around, scale of the flat)` for which the tube's period is a whole number of cells.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -49,6 +50,20 @@ def test_a_hemisphere_is_proven_out_of_reach_and_said_where() -> None:
     assert height_mm[report.excess_log > 0].min() > height_mm[report.excess_log < 0].max()
     codes = [finding.code for finding in report.findings]
     assert codes == ["FIT-SPREAD", "FIT-WHERE", "FIT-WHERE", "FIT-PROVEN"]
+
+
+def test_the_report_is_plain_json_and_its_map_shows_what_is_out() -> None:
+    mesh = hemisphere(edge_mm=8)
+    report = feasibility(mesh, PAPER)
+    told = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    assert told["fits"] is False
+    assert told["proven_infeasible"] is True
+    red, green, blue = report.colors(mesh).astype(int).T
+    height_mm = mesh.vertices_mm[:, 2]
+    assert (red > blue + 30)[height_mm.argmax()]
+    assert (blue > red + 30)[height_mm.argmin()]
+    inside = np.unique(mesh.faces[report.excess_log == 0])
+    assert (red[inside] == green[inside]).any()
 
 
 def test_cones_make_a_hemisphere_feasible_on_request() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from design.errors import FlattenError
 from design.flatten import Flattening, FlattenOptions, flatten
@@ -88,6 +89,21 @@ def test_a_tube_is_scaled_to_whole_cells() -> None:
         assert flat.scaled(scale).seams[0].translation_mm[0] == pytest.approx(10.0 * count)
         assert flat.scaled(scale).expansion_ratio * scale == pytest.approx(flat.expansion_ratio)
     assert flatten(cap(edge_mm=12)).whole_cell_scales(10.0, 0.5, 2) == []
+
+
+def test_an_unrolled_tube_covers_a_period_whole_wherever_its_seam_runs() -> None:
+    flat = flatten(vase(edge_mm=6))
+    points_mm, faces, face_of = flat.unrolled()
+    period_mm = flat.seams[0].translation_mm[0]
+    triangles = shapely.polygons(points_mm[faces])
+    assert shapely.area(triangles) == pytest.approx(shapely.area(shapely.polygons(flat.flat_mm[flat.faces]))[face_of])
+    middle_mm = flat.flat_mm.mean(axis=0)
+    low, high = np.quantile(flat.flat_mm[:, 1], [0.3, 0.7])
+    window = shapely.box(middle_mm[0] - period_mm / 2, low, middle_mm[0] + period_mm / 2, high)
+    assert shapely.intersection(triangles, window) is not None
+    assert shapely.area(shapely.intersection(triangles, window)).sum() == pytest.approx(window.area, rel=1e-9)
+    plain = flatten(cap(edge_mm=12))
+    assert plain.unrolled()[0] is plain.flat_mm
 
 
 def test_a_short_wide_ring_is_a_disk_with_a_hole_and_a_seam_only_when_asked() -> None:
