@@ -30,6 +30,7 @@ from fabctl.cut.plan import CutPlan, frame_lines, plan_cut, program_times
 from fabctl.cut.preflight import Sheet
 from fabctl.cut.program import read_program
 from fabctl.cut.progress import Track
+from fabctl.cut.trail import PROGRAM_BEGINS
 from fabctl.cut.wirelog import WireLog
 from fabctl.errors import FabctlError, RefusedError, Stopped, UsageError
 from fabctl.events import Emit, Event
@@ -207,6 +208,7 @@ def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: L
             "material": order.material.model_dump(mode="json"),
             "origin": order.origin,
             "placement": plan.affine.rows(),
+            "work_offset_mm": list(plan.work_offset_mm),
             "plan": summary(plan, identity_of(laser)),
         },
     )
@@ -232,6 +234,8 @@ def recorded(run: RunFolder, laser: Laser, log: WireLog, desk: Desk, plan: CutPl
     write_event = run.log_events()
 
     def tell(event: Event) -> None:
+        if "mark" in event.data:
+            log.mark(str(event.data["mark"]), laser.clock.now_s())
         write_event(event)
         desk.emit(event)
 
@@ -273,7 +277,7 @@ def execute(
         recheck_offset(laser, plan)
     if order.frame:
         frame(laser, plan, order, config, desk)
-    desk.emit(Event("stage", f"cutting, {minutes(plan.times.total_s)}"))
+    desk.emit(Event("stage", f"cutting, {minutes(plan.times.total_s)}", data={"mark": PROGRAM_BEGINS}))
     began_s = time.monotonic()
     progress, _ = run_plan(laser, plan, config.max_run_on_s, desk.emit, desk.keys)
     actual_s = time.monotonic() - began_s

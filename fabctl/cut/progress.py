@@ -74,7 +74,7 @@ class Track:
     _first: int = 0
 
     def __post_init__(self) -> None:
-        self._last_step = _last_steps(self.program)
+        self._last_step = last_steps(self.program)
         self.line_end_s = [self.times.end_s[k] if k >= 0 else 0.0 for k in self._last_step]
 
     def limit_count(self) -> int:
@@ -112,7 +112,7 @@ class Track:
         return min(self.done_s / self.times.total_s, 1.0) if self.times.total_s > 0 else 0.0
 
 
-def _last_steps(program: Program) -> list[int]:
+def last_steps(program: Program) -> list[int]:
     """Return for every line the index of the last step up to and including it, -1 before the first."""
     last = [-1] * len(program.lines)
     for k, step in enumerate(program.steps):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import IO
 
@@ -27,6 +28,10 @@ class WireLog:
                 raise OSError(28, "the disk took only part of the row")
         except OSError as fault:
             raise RecordError(f"{self._path}: {fault.strerror or fault}; the run was stopped") from fault
+
+    def mark(self, remark: str, t_s: float) -> None:
+        """Keep a remark among the bytes, such as where the program begins."""
+        self.note(json.dumps({"t_s": round(t_s, 6), "dir": "#", "bytes": remark}))
 
     def write_to(self, path: Path) -> None:
         """From now on, write to `path`; what came before goes first."""

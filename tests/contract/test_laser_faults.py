@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks._laser_rig import Rig, Watch, lit_while_standing, slits
 from drivers.errors import TransportError
 from drivers.grbl.faults import BoardRestarted, DoubledOk, GarbledLine, LinkStalled, LostOk
 from drivers.grbl.run import run_program
 from simulators.faults import Fault
-from tests.contract.laser_pipes import Rig, Watch, lit_while_standing, slits
 
-SEEDS = range(20)
+SEEDS = range(5)  # `python -m benchmarks laser` does twenty
 PROGRAM = slits(70)
 EXPECTED: dict[str, tuple[type[Exception], ...]] = {
     "lost-ok": (LostOk,),

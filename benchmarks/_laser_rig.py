@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -31,6 +32,10 @@ class VirtualClock:
         self._board.advance_to(self.now_s() + duration_s)
 
 
+class Killed(BaseException):
+    """The host process is gone: nothing more is sent, no clean-up runs."""
+
+
 @dataclass
 class Rig:
     """A board, its line with at most one fault in it, the beam's trace, and every line the board was given."""
@@ -42,6 +47,7 @@ class Rig:
     trace: list[Point] = field(default_factory=list)
     sent: bytearray = field(default_factory=bytearray)
     unplugged: bool = False
+    dies_s: float = math.inf  # from this moment on the host is dead
     before_send: Callable[[bytes], None] = lambda data: None
 
     def __post_init__(self) -> None:
@@ -61,7 +67,15 @@ class Rig:
     def laser(self) -> Laser:
         return Laser(self.transport, self.clock)
 
+    def revive(self) -> MemoryTransport:
+        """Return a new line to the same board, for a new host."""
+        self.dies_s = math.inf
+        self.board.take()
+        return MemoryTransport(self._send, self._receive)
+
     def _send(self, data: bytes) -> None:
+        if self.clock.now_s() >= self.dies_s:
+            raise Killed
         if self.unplugged:
             raise TransportError("memory://board", "the line broke")
         self.before_send(data)
@@ -72,6 +86,8 @@ class Rig:
     def _receive(self, timeout_s: float) -> bytes:
         end_s = self.clock.now_s() + timeout_s
         while True:
+            if self.clock.now_s() >= self.dies_s:
+                raise Killed
             if self.unplugged:
                 raise TransportError("memory://board", "the line broke")
             out = self._through(self.board.take())
