@@ -21,6 +21,7 @@ from fabctl.cut.trail import MARK, PROGRAM_BEGINS, read_trail, rest_of, stopped_
 from fabctl.events import silent
 from simulators.grbl.board import Point
 
+KILLS = range(100)
 RUN_ON_S = 5.0
 GRID_MM = 0.05
 ABSENCES_S = (0.3, 1.0, 3.0, 30.0)
@@ -40,7 +41,7 @@ def follow(laser: Laser, program: Program, rows: list[str]) -> None:
     run_program(laser, plan.lines, CutWatch(plan, Track(program, plan.times, RUN_ON_S), silent, no_keys))
 
 
-def killed_run(seed: int, program: Program) -> tuple[Rig, list[str], float]:
+def killed_run(seed: int, program: Program, absence_s: float | None = None) -> tuple[Rig, list[str], float]:
     """Return a board whose host died in mid-job, the host's log, and when it died."""
     rig, rows, rng = Rig(), list[str](), random.Random(seed)
     laser = host(rig, rows)
@@ -51,7 +52,7 @@ def killed_run(seed: int, program: Program) -> tuple[Rig, list[str], float]:
         follow(laser, program, rows)
     died_s = rig.dies_s
     rig.dies_s = math.inf
-    rig.board.advance_to(died_s + rng.choice(ABSENCES_S))
+    rig.board.advance_to(died_s + (rng.choice(ABSENCES_S) if absence_s is None else absence_s))
     return rig, rows, died_s
 
 
@@ -87,7 +88,8 @@ def resumed(rig: Rig, rows: list[str], program: Program, died_s: float, restart:
     """Go on with a killed cut as a new host would; return whether the position was kept."""
     if restart:
         rig.board.restart()
-    laser = host(rig, again := [])
+    again: list[str] = []
+    laser = host(rig, again)
     assert laser.identity is not None
     times = program_times(program, laser.identity)
     trail = read_trail("\n".join(rows), program, times, (0.0, 0.0, 0.0))

@@ -1,0 +1,309 @@
+"""The laser room's figures: `python -m benchmarks laser [--url URL] [--quick]`.
+
+Without `--url`, on the simulated board in virtual time, which makes every figure repeatable. With `--url`, those that
+need no motion are measured on whatever answers there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks import Figure
+from benchmarks._laser_jobs import JOBS, burnt_against, dense_job
+from benchmarks._laser_kills import KILLS, killed_run, missing_count, resumed, twice_mm
+from benchmarks._laser_kills import PROGRAM as KILL_PROGRAM
+from benchmarks._laser_rig import LAB, Rig, Watch, lit_while_standing, slits
+from drivers.errors import DeviceError, TransportError
+from drivers.grbl.check import check_program
+from drivers.grbl.faults import BoardRestarted, DoubledOk, GarbledLine, LinkStalled, LostOk
+from drivers.grbl.laser import Laser
+from drivers.grbl.run import StoppedByOperator, run_program
+from drivers.transport import open_transport
+from fabctl.cut.estimate import Dynamics, estimate
+from fabctl.cut.program import read_program
+from simulators.faults import Fault
+
+WIRE_LINES_S, LINE_BYTES = 1239.0, 9.3
+SEEDS_COUNT = 20
+EXPECTED: dict[str, type[Exception] | None] = {
+    "lost-ok": LostOk,
+    "double-ok": DoubledOk,
+    "corrupt": GarbledLine,
+    "nul": None,
+    "merged": None,
+    "banner": BoardRestarted,
+    "unplug": TransportError,
+    "stall": LinkStalled,
+}
+
+
+def measure(words: list[str]) -> list[Figure]:
+    """Return the figures; `--quick` takes fewer lines, seeds and kills."""
+    quick = "--quick" in words
+    url = words[words.index("--url") + 1] if "--url" in words else None
+    if url is not None:
+        return [*throughput(url, 5_000 if quick else 100_000), reaction(url)]
+    return [
+        *throughput(None, 5_000 if quick else 100_000),
+        pacer(),
+        *burn(),
+        *faults(4 if quick else SEEDS_COUNT),
+        slow_move(),
+        *pin(),
+        *kills(10 if quick else len(KILLS)),
+        *estimates(),
+    ]
+
+
+def nine_bytes(count: int) -> list[str]:
+    """Return lines that are 9.3 bytes long on average, newline included."""
+    return [
+        "G21G90",
+        "G1F1000",
+        *(f"X{k % 90 + 10}Y{k % 70 + 10:02d}" + ("." if k % 3 else ".5") for k in range(count)),
+    ]
+
+
+def throughput(url: str | None, count: int) -> list[Figure]:
+    """Measure check-mode lines per second on a paced line, against the wire's own limit for these lines."""
+    lines = nine_bytes(count)
+    mean_bytes = sum(len(line) + 1 for line in lines) / len(lines)
+    with tempfile.TemporaryDirectory() as folder:
+        process, address = (None, url) if url else start_board(Path(folder) / "port")
+        try:
+            with Laser(open_transport(str(address))) as laser:
+                laser.connect()
+                if laser.report().state == "Alarm":
+                    laser.unlock()
+                began_s = time.perf_counter()
+                refused = check_program(laser.link, lines, laser.identity.rx_bytes if laser.identity else 128)
+                took_s = time.perf_counter() - began_s
+                laser.end()
+        finally:
+            if process is not None:
+                process.terminate()
+                process.wait()
+    rate = len(lines) / took_s
+    wire = 11_520 / mean_bytes
+    return [
+        Figure(f"check-mode throughput, {mean_bytes:.1f} B lines", round(rate), "lines/s",
+               f">= 95 % of the wire ({0.95 * wire:.0f} lines/s)", rate >= 0.95 * wire, count),
+        Figure("lines refused in check mode", len(refused), "", "0 of 100,000", not refused, count),
+    ]  # fmt: skip
+
+
+def start_board(port: Path, *more: str) -> tuple[subprocess.Popen[str], str]:
+    """Start a simulated board behind a pty; return the process and its URL."""
+    command = [sys.executable, "-m", "simulators", "grbl", "--pty", str(port), "--set", "32=1", *more]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert process.stdout is not None
+    return process, process.stdout.readline().split()[1]
+
+
+def pacer() -> Figure:
+    """Measure the fastest second of the simulated line, host to board, in virtual time."""
+    rig = Rig()
+    arrivals: list[float] = []
+    interrupt = rig.board._interrupt
+
+    def noted(byte: int) -> bool:
+        arrivals.append(rig.clock.now_s())
+        return interrupt(byte)
+
+    rig.board._interrupt = noted  # type: ignore[method-assign]
+    rig.board.receive(b"G4P0\n" * 4000)
+    rig.board.advance_to(rig.clock.now_s() + 3)
+    worst = max((k + 11_520 for k in range(0, len(arrivals) - 11_520, 97)), default=0)
+    fastest = min((arrivals[k] - arrivals[k - 11_520] for k in range(11_520, worst)), default=math.inf)
+    rate = 11_520 / fastest
+    return Figure(
+        "the pacer's fastest second", round(rate, 1), "B/s", "never above 11,520", rate <= 11_520.5, len(arrivals)
+    )
+
+
+def burn() -> list[Figure]:
+    """Compare the burnt picture with the programs that were asked for."""
+    worst_mm, missing, extra, twice = 0.0, 0, 0, 0.0
+    for name, lines in JOBS.items():
+        found = burnt_against(name, lines)
+        worst_mm = max(worst_mm, found.worst_mm)
+        missing, extra = missing + found.missing_count, extra + found.extra_count
+        twice = max(twice, abs(found.excess_mm))
+    n = len(JOBS)
+    return [
+        Figure("burn trace: farthest from the design", round(worst_mm, 4), "mm", "within 0.02 mm", worst_mm <= 0.02, n),
+        Figure("burn trace: design points not burnt", missing, "", "every slit burnt", missing == 0, n),
+        Figure("burn trace: burnt points off the design", extra, "", "nothing else", extra == 0, n),
+        Figure(
+            "burn trace: length burnt too much per stroke", round(twice, 4), "mm", "once (0.02 mm)", twice <= 0.02, n
+        ),
+    ]
+
+
+def faults(seeds_count: int) -> list[Figure]:
+    """Let every fault happen; count how many are named rightly, how soon, and whether a line was ever sent twice."""
+    program = slits(70)
+    right = total = resent = 0
+    slowest_s = 0.0
+    for kind, expected in EXPECTED.items():
+        for seed in range(seeds_count):
+            rig = Rig(fault=Fault(kind, seed))
+            laser = rig.laser()
+            laser.connect()
+            stops: list[float] = []
+            rig.before_send = (
+                lambda data, rig=rig, stops=stops: (  # type: ignore[misc]
+                    stops.append(rig.clock.now_s()) if data[:1] in (b"!", b"\x18") else None
+                )
+            )
+            caught: type[Exception] | None = None
+            try:
+                run_program(laser, program, Watch())
+            except DeviceError as fault:
+                caught = type(fault)
+            total += 1
+            right += caught is expected
+            sent = re.sub(rb"[?!~\x18\x80-\xff]", b"", bytes(rig.sent)).decode().split("\n")
+            lines = [line for line in sent if line and line[0] != "$"]
+            resent += lines != program[: len(lines)]
+            if rig.fault is not None and rig.fault.done_s is not None and kind in ("corrupt", "banner", "stall"):
+                slowest_s = max(slowest_s, stops[0] - rig.fault.done_s)
+    return [
+        Figure("faults classified rightly", f"{right}/{total}", "", "each × 20 seeds, all", right == total, total),
+        Figure("slowest reaction to the evidence", round(slowest_s, 3), "s", "within 1 s", slowest_s < 1.0, total),
+        Figure("runs in which a line was sent twice or out of order", resent, "", "never", resent == 0, total),
+    ]
+
+
+def slow_move() -> Figure:
+    """Run a single move of 60 s and see that nobody takes it for a stall."""
+    rig = Rig()
+    laser = rig.laser()
+    laser.connect()
+    begun_s = rig.clock.now_s()
+    try:
+        run_program(laser, ["G21", "G90", "M4S0", "G0X-200Y-150", "G1X-190F10S300", "M5", "G4P0.01"], Watch())
+        healthy = True
+    except DeviceError:
+        healthy = False
+    took_s = rig.clock.now_s() - begun_s
+    return Figure(
+        "a healthy move of 60 s runs through", round(took_s, 1), "s", "never aborted", healthy and took_s > 60, 1
+    )
+
+
+def pin() -> list[Figure]:
+    """Measure when the beam is off after a hold and after an abort at 25 mm/s and 500 mm/s²."""
+    hold_s, abort_s = [], []
+    for seed in range(20):
+        rig = Rig()
+        laser = rig.laser()
+        laser.connect()
+        at_s = rig.clock.now_s() + 1.0 + 0.0137 * seed
+        watch = Watch([(at_s, "hold"), (at_s + 0.6, "stop")], rig.clock)
+        sent_s: list[float] = []
+        rig.before_send = (
+            lambda data, rig=rig, sent_s=sent_s: (  # type: ignore[misc]
+                sent_s.append(rig.clock.now_s()) if data[:1] == b"!" else None
+            )
+        )
+        with contextlib.suppress(StoppedByOperator):
+            run_program(laser, ["G21", "G90", "M4S0", "G1X-100F1500S500", "M5", "G4P0.01"], watch)
+        hold_s.append(next(p.t_s for p in rig.trace if p.t_s >= sent_s[0] and p.power_frac == 0) - sent_s[0])
+        rig = Rig()
+        rig.board.receive(b"G21G90M4S0\nG1X-100F1500S500\n")
+        rig.board.advance_to(rig.clock.now_s() + 1.0 + 0.0137 * seed)
+        began_s = rig.clock.now_s()
+        rig.board.receive(b"\x18")
+        rig.board.advance_to(began_s + 1.0)
+        abort_s.append(next(p.t_s for p in rig.trace if p.t_s >= began_s and p.power_frac == 0) - began_s)
+    brake_s = 25 / 500
+    limit_s = brake_s + 0.050
+    return [
+        Figure("beam off after a hold (braking takes 50 ms)", round(1000 * max(hold_s), 1), "ms",
+               "within deceleration + 50 ms", max(hold_s) <= limit_s + 0.001, len(hold_s)),
+        Figure("beam off after an abort", round(1000 * max(abort_s), 2), "ms", "at once", max(abort_s) < 0.001, 20),
+    ]  # fmt: skip
+
+
+def kills(count: int) -> list[Figure]:
+    """Kill the host at random moments; look at the beam, resume, and look at what was burnt."""
+    program = read_program(KILL_PROGRAM)
+    lit_s, missing, worst_mm, kept = 0.0, 0, 0.0, 0
+    lost_missing, lost_mm, believed = 0, 0.0, 0
+    for seed in range(count):
+        rig, rows, died_s = killed_run(seed, program)
+        kept += resumed(rig, rows, program, died_s)
+        lit_s = max(lit_s, lit_while_standing(rig.trace))
+        missing += missing_count(rig, program)
+        worst_mm = max(worst_mm, twice_mm(rig, program))
+        rig, rows, died_s = killed_run(seed, program, absence_s=0.0)
+        believed += resumed(rig, rows, program, died_s, restart=True)
+        lost_missing += missing_count(rig, program)
+        lost_mm = max(lost_mm, twice_mm(rig, program))
+    slit_mm = 5.0
+    return [
+        Figure("beam on while standing after a kill", round(lit_s, 4), "s", "never (100 kills)", lit_s < 0.015, count),
+        Figure("kills with the position kept", f"{kept}/{count}", "", "board alive: all", kept == count, count),
+        Figure("geometry left unburnt after kill and resume", missing, "points", "100 % burnt", missing == 0, count),
+        Figure("burnt twice per kill, board alive", round(worst_mm, 3), "mm", "<= 1 mm", worst_mm <= 1.0, count),
+        Figure("restarted boards believed", believed, "", "refused until homed", believed == 0, count),
+        Figure("geometry left unburnt, position lost", lost_missing, "points", "100 % burnt", lost_missing == 0, count),
+        Figure("burnt twice per kill, position lost", round(lost_mm, 2), "mm", "<= one slit (5 mm)",
+               lost_mm <= slit_mm, count),
+    ]  # fmt: skip
+
+
+def estimates() -> list[Figure]:
+    """Compare the estimated time of ten different jobs with the simulated board's own."""
+    dynamics = Dynamics.of({number: float(value) for number, value in LAB.items()})
+    errors: list[tuple[float, str]] = []
+    for name, lines in {**JOBS, "dense": dense_job()}.items():
+        rig = Rig()
+        rig.board.trace = None
+        laser = rig.laser()
+        laser.connect()
+        program = read_program(lines, start_mm=(-1.0, -1.0))
+        guess_s = estimate(program.steps, dynamics, sum(len(line) + 1 for line in lines)).total_s
+        begun_s = rig.clock.now_s()
+        ended_s: list[float] = []
+        run_program(laser, program.lines, EndWatch(ended_s, len(program.lines)))
+        errors.append((guess_s / (ended_s[0] - begun_s) - 1, name))
+    worst, name = max(errors, key=lambda item: abs(item[0]))
+    return [
+        Figure(f"time estimate, worst of {len(errors)} jobs ({name})", round(100 * worst, 2), "%", "within 2 %",
+               abs(worst) <= 0.02, len(errors))
+    ]  # fmt: skip
+
+
+class EndWatch(Watch):
+    """Notes when the last line was answered."""
+
+    def __init__(self, ended_s: list[float], count: int) -> None:
+        super().__init__()
+        self.ended_s, self.count = ended_s, count
+
+    def seen(self, progress: object, now_s: float) -> None:
+        """Note the first report after the last answer."""
+        if getattr(progress, "answered_count", 0) == self.count:
+            self.ended_s.append(now_s)
+
+
+def reaction(url: str) -> Figure:
+    """Measure how long a status question takes to be answered."""
+    with Laser(open_transport(url)) as laser:
+        laser.connect()
+        times = []
+        for _ in range(50):
+            began_s = time.perf_counter()
+            laser.report()
+            times.append(time.perf_counter() - began_s)
+    return Figure("answer to a status question", round(1000 * sorted(times)[len(times) // 2], 1), "ms", "", None, 50)
