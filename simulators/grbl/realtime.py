@@ -217,6 +217,7 @@ def _suspended(m: Machine) -> Program:
     while m.suspend:
         if m.aborted():
             return
+        before = (m.suspend, m.spindle_stop, m.state, m.asked)
         if Suspend.HELD in m.suspend:
             if m.state in (State.DOOR, State.SLEEP):
                 yield from _door_or_sleep(m, mode, speed, flood)
@@ -227,7 +228,6 @@ def _suspended(m: Machine) -> Program:
             elif m.stepper.update_pin:
                 m.set_spindle(mode, speed)
                 m.stepper.update_pin = False
-        before = (m.suspend, m.spindle_stop, m.state, m.asked)
         yield from _system(m)
         if m.suspend and (m.suspend, m.spindle_stop, m.state, m.asked) == before and not m.aborted():
             yield ANY
