@@ -27,7 +27,7 @@ from fabctl.indent.recorder import Row
 Wish = Literal["go", "pause", "stop"]
 SHOWN_HZ = 12.0
 HOMING_MM_S = 8.0
-FREE_S, FREE_SIGMA, FREE_N = 0.25, 4.0, 2e-3
+FREE_S, FREE_SIGMA, FREE_FRAC = 0.25, 4.0, 0.1
 MORE_ROOM_COUNT = 6
 
 
@@ -217,12 +217,12 @@ class Runner:
             forces = []
             while self.clock.now_s() < until_s:
                 forces.append(self._fresh().force_N - self._tare_N)
-            if statistics.fmean(forces) < FREE_SIGMA * statistics.pstdev(forces) / len(forces) ** 0.5 + FREE_N:
+            if statistics.fmean(forces) < FREE_SIGMA * statistics.pstdev(forces) / len(forces) ** 0.5 + FREE_FRAC * (action.force_N or 0.0):
                 return
             self._clear_mm = max(0.0, self._clear_mm - action.clearance_mm)
             self._drive(self._clear_mm, action.speed_mm_s)
         raise ForceOffZero(
-            f"after the approach the force stays {statistics.fmean(forces):.3f} N above the tare, "
+            f"after the approach the force stays {statistics.fmean(forces):.4f} N above the tare, "
             f"{MORE_ROOM_COUNT} times the clearance above contact; does the specimen stick, or the cell drift?"
         )
 

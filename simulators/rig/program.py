@@ -118,9 +118,10 @@ def parse(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--unit", type=int, default=1)
     parser.add_argument("--baud", type=int, default=115200, help="pace of the serial line; 0: as fast as it goes")
     parser.add_argument("--turnaround-ms", type=float, default=1.0)
-    parser.add_argument("--noise-N", type=float, default=0.01)
-    parser.add_argument("--drift-N-s", type=float, help="[drawn from the seed, up to 0.3 mN/s]")
-    parser.add_argument("--zero-N", type=float, help="[drawn, up to 0.2 N]")
+    parser.add_argument("--noise-N", type=float, default=3e-4, help="of one conversion, a thousand a second")
+    parser.add_argument("--drift-N-s", type=float, help="[drawn from the seed, up to 5 µN/s]")
+    parser.add_argument("--zero-N", type=float, help="[drawn, up to 20 mN]")
+    parser.add_argument("--capacity-N", type=float, default=20.0)
     parser.add_argument("--gain", type=float, help="[drawn, within 0.5 %%]")
     parser.add_argument("--contact-mm", type=float, help="[drawn, 5 to 7 mm below home]")
     parser.add_argument("--compliance-mm-N", type=float, default=0.02)
@@ -148,10 +149,11 @@ def drawn(words: argparse.Namespace) -> Machine:
     }
     machine = Machine(
         noise_N=words.noise_N,
+        capacity_N=words.capacity_N,
         compliance_mm_N=words.compliance_mm_N,
         backlash_mm=words.backlash_mm,
-        drift_N_s=rng.uniform(-3e-4, 3e-4),
-        zero_N=rng.uniform(-0.2, 0.2),
+        drift_N_s=rng.uniform(-5e-6, 5e-6),
+        zero_N=rng.uniform(-0.02, 0.02),
         gain_ratio=rng.uniform(0.995, 1.005),
         contact_mm=rng.uniform(5.0, 7.0),
     )
