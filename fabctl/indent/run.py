@@ -217,7 +217,9 @@ class Runner:
             forces = []
             while self.clock.now_s() < until_s:
                 forces.append(self._fresh().force_N - self._tare_N)
-            if statistics.fmean(forces) < FREE_SIGMA * statistics.pstdev(forces) / len(forces) ** 0.5 + FREE_FRAC * (action.force_N or 0.0):
+            if statistics.fmean(forces) < FREE_SIGMA * statistics.pstdev(forces) / len(forces) ** 0.5 + FREE_FRAC * (
+                action.force_N or 0.0
+            ):
                 return
             self._clear_mm = max(0.0, self._clear_mm - action.clearance_mm)
             self._drive(self._clear_mm, action.speed_mm_s)
