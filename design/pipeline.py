@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,8 @@ from design.cells.select import Choice, SelectionCurve, on_curve, select, select
 from design.cells.sheet import Sheet
 from design.errors import OutOfLibrary
 from design.findings import Finding
-from design.flatten import Flattening, flatten
+from design.flatten import Flattening, Limits, feasibility, flatten
+from design.flatten.ladder import Remedy
 from design.job import Job, JobOptions, compose_job
 from design.pattern.assign import averaged, factor
 from design.pattern.border import framed
@@ -81,10 +83,11 @@ def build(
     `findings` are those of reading the inputs.
     """
     watch("flattening the surface", 0.0)
-    flat = flatten(mesh, spec.flatten)
-    found = [*findings, *flat.findings]
+    found = list(findings)
+    curve = None if spec.selection.rule == "published" else selection_curve(library, spec.selection)
+    flat = lay_flat(spec, mesh, curve, found)
     watch("choosing cells", 0.2)
-    placed, tiling, wanted, choice = choose(spec, flat, library, found)
+    placed, tiling, wanted, choice = choose(spec, flat, library, curve, found)
     hinge = hinge_widths_mm(choice.expansion_ratio, spec.hinge)
     watch("drawing slits", 0.4)
     cells = Cells(tiling, wanted, choice, hinge, tuple("cut" for _ in wanted))
@@ -101,11 +104,33 @@ def build(
     return Design(spec, library.sheet, mesh, placed, cells, drawing, job, predicted, tuple(found), library.hash)
 
 
+def lay_flat(spec: DesignSpec, mesh: TriMesh, curve: SelectionCurve | None, found: list[Finding]) -> Flattening:
+    """Return the flat of `mesh`, by the first rung of the ladder on which the library's range is enough.
+
+    Raises `OutOfLibrary` with what the ladder found where it ends before that. Cones that the specification asks for
+    are placed without climbing.
+    """
+    remedy = {"report": "none"}.get(spec.infeasible, spec.infeasible)
+    if curve is None or spec.flatten.cones_count:
+        flat = flatten(mesh, spec.flatten)
+        found += flat.findings
+        return flat
+    low, high = curve.range_ratio()
+    report = feasibility(mesh, Limits(low, high, spec.cell_mm), spec.flatten, cast(Remedy, remedy))
+    flat = report.flattening()
+    found += [finding for finding in report.findings if finding not in found]
+    found += [finding for finding in flat.findings if finding not in found]
+    if report.best() is None:
+        expansion = flat.expansion_ratio / report.scale_ratio
+        raise OutOfLibrary(float(expansion.min()), float(expansion.max()), (low, high), found)
+    return flat
+
+
 def choose(
-    spec: DesignSpec, flat: Flattening, library: CellLibrary, found: list[Finding]
+    spec: DesignSpec, flat: Flattening, library: CellLibrary, curve: SelectionCurve | None, found: list[Finding]
 ) -> tuple[Flattening, Tiling, Array, Choice]:
     """Return the flat in its final scale and place, its cells, what they must expand by, and the cells chosen."""
-    if spec.selection.rule == "published":
+    if curve is None:
         tiling = tile(flat.flat_mm, flat.faces, spec.cell_mm).compact()
         wanted = averaged(tiling, flat.flat_mm, flat.faces, flat.expansion_ratio**2, spec.averaging)
         wanted *= PUBLISHED_HIGH_RATIO / wanted.max()
@@ -115,7 +140,6 @@ def choose(
                     hint="the deployed sheet has not the target's size; take another selection rule for that")
         )  # fmt: skip
         return flat, tiling, wanted, choice
-    curve = selection_curve(library, spec.selection)
     flat, tiling, wanted = scaled(spec, flat, curve, found)
     return flat, tiling, wanted, on_curve(curve, wanted)
 

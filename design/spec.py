@@ -13,7 +13,7 @@ from design.pattern.slits import HingeOptions
 from design.pattern.tiling import Placement
 from design.pattern.toolpath import ToolOptions
 
-Infeasible = Literal["report", "closest"]
+Infeasible = Literal["report", "cones", "nearest", "both"]
 
 
 @dataclass(frozen=True, slots=True)

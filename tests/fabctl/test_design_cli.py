@@ -1,0 +1,76 @@
+"""`fabctl design` from the outside: folders, exit codes, everything wrong said at once."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from design.bundle import open_bundle
+from design.errors import UnreadableMesh
+from fabctl.designing import read_inputs
+from fabctl.errors import ConfigError, RefusedError, UsageError
+
+SPEC = """
+name: small-cap
+target: {make: cap, radius_mm: 40, edge_mm: 5}
+response: null
+placement: centred
+"""
+
+
+def run(words: list[str], home: Path) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "fabctl", "--home", str(home), *words]
+    return subprocess.run(line, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_build_writes_the_folder_and_prints_json(tmp_path: Path) -> None:
+    (tmp_path / "spec.yaml").write_text(SPEC)
+    done = run(["design", "build", str(tmp_path / "spec.yaml"), "-o", str(tmp_path / "cap"), "--json"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    bundle = open_bundle(tmp_path / "cap")
+    assert found["cells_count"] == len(bundle.cells())
+    assert found["sheet_mm"] == list(bundle.drawing().size_mm)
+    assert bundle.file("spec.yaml").read_text() == SPEC
+    again = run(["design", "build", str(tmp_path / "spec.yaml"), "-o", str(tmp_path / "cap")], tmp_path)
+    assert again.returncode == 3
+    assert "exists already" in again.stderr
+
+
+def test_a_specification_with_faults_is_refused_with_all_of_them_and_their_lines(tmp_path: Path) -> None:
+    (tmp_path / "spec.yaml").write_text("name: x\ntarget: a.obj\ncell_mm: -1\nscale: {end: top}\ntypo: 1\n")
+    with pytest.raises(ConfigError) as fault:
+        read_inputs(str(tmp_path / "spec.yaml"), tmp_path)
+    assert fault.value.exit_code == 2
+    for line in ("spec.yaml:3: cell_mm", "spec.yaml:4: scale.end", "spec.yaml:5: typo"):
+        assert line in str(fault.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "says"),
+    [
+        ("name: x\ntarget: {make: spoon}\n", UsageError, "spoon"),
+        ("name: x\ntarget: {make: saddle, half_angle_deg: 20}\n", UsageError, "no such measure"),
+        ("name: x\ntarget: {make: cap}\nmaterial: neoprene-2.0\n", RefusedError, "hydrogen chloride"),
+        ("name: x\ntarget: nowhere.obj\n", UnreadableMesh, "nowhere.obj"),
+        ("name: x\ntarget: {make: cap}\nscale: {end: value}\n", ConfigError, "high_ratio"),
+    ],
+)
+def test_what_cannot_be_built_is_refused_with_its_reason(
+    text: str, kind: type[Exception], says: str, tmp_path: Path
+) -> None:
+    (tmp_path / "spec.yaml").write_text(text)
+    with pytest.raises(kind, match=says):
+        read_inputs(str(tmp_path / "spec.yaml"), tmp_path)
+
+
+def test_a_smaller_cell_scales_slit_and_hinge_and_overrides_the_file(tmp_path: Path) -> None:
+    (tmp_path / "spec.yaml").write_text(SPEC)
+    inputs = read_inputs(str(tmp_path / "spec.yaml"), tmp_path, cell_mm=5.0)
+    assert inputs.spec.cell_mm == inputs.library.sheet.edge_mm == 5.0
+    assert inputs.library.sheet.slit_mm == pytest.approx(0.0625)
+    assert inputs.spec.hinge.width_mm == pytest.approx(0.125)
