@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
+from design.cells.bending_map import load_bending
 from design.cells.library import CellLibrary
 from design.cells.select import Choice
 from design.deploy.indentation import Response, indentation_response
@@ -17,11 +18,6 @@ from design.findings import Finding
 from design.flatten import Flattening
 from design.pattern.tiling import Array, Tiling
 from design.spec import ResponseOptions
-
-# Bending stiffness over that of the uncut sheet along the stiffest-cell curve, computed with prestress on the deployed
-# two-unit cell in three dimensions; it hardly depends on how the curve is chosen.
-BENDING_AT_RATIO = np.array([1.16, 1.20, 1.30, 1.40, 1.50, 1.60, 1.70, 1.77])
-BENDING_RATIO = np.array([0.084, 0.095, 0.106, 0.100, 0.093, 0.084, 0.073, 0.061])
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +61,7 @@ def layout_of(tiling: Tiling, choice: Choice, library: CellLibrary) -> Layout:
     # At the very rim of the map Poisson's ratio cannot be interpolated: the nearest cell's is as good.
     nu = np.where(np.isfinite(at.nu_tangent_ratio), at.nu_tangent_ratio, _nearest_nu(choice, library))
     flat_mm2 = 6 * np.sqrt(3) / 4 * sheet.edge_mm**2
-    solid_mJ = sheet.E_MPa * sheet.thickness_mm**3 / 12
-    bending = solid_mJ * np.interp(choice.expansion_ratio, BENDING_AT_RATIO, BENDING_RATIO)
+    bending = load_bending().D_mJ(choice.expansion_ratio, choice.theta_rad, sheet)
     return sheet_layout(tiling.vertices_mm, cells, choice.expansion_ratio, choice.stiffness_mJ / flat_mm2, nu, bending)
 
 
