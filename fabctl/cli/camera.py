@@ -270,7 +270,7 @@ def register(
 
     sheet = load_board(sheet_name, lab().root).mark_sheet()
     _, state = _bench(bench_name)
-    job = tuple(read_paths(design / "paths.json")) if design else ()
+    job = read_paths(design / "paths.json") if design else ()
     found = find_sheet(state, _picture(bench_name, image), sheet, thickness_mm, job)
     made = found.registration
     overlay = output.with_suffix(".png")
@@ -283,23 +283,17 @@ def register(
     show(data, as_json, [f"{output}: {text}", f"{overlay}: the job on the bed", *map(str, found.findings)])
 
 
-def read_paths(path: Path) -> list[CutPath]:
+def read_paths(path: Path) -> tuple[CutPath, ...]:
     """Return the strokes of a design folder's `paths.json`."""
-    import numpy as np
-
-    from design.pattern.paths import CutPath
+    from design.pattern.drawing import from_json
     from fabctl.errors import BundleError
 
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))["paths"]
-        return [
-            CutPath(row["layer"], np.array(row["points_mm"], dtype=float), bool(row["closed"]), row.get("cell"))
-            for row in rows
-        ]
+        return from_json(json.loads(path.read_text(encoding="utf-8"))).paths
     except OSError as fault:
         raise BundleError(f"{path}: {fault.strerror}") from fault
-    except (KeyError, TypeError, ValueError) as fault:
-        raise BundleError(f"{path}: not the strokes of a design: {fault}") from fault
+    except ValueError as fault:
+        raise BundleError(f"{path}: not JSON: {fault}") from fault
 
 
 def _bench(name: str) -> tuple[BenchConfig, Path]:

@@ -231,7 +231,7 @@ def _quadrilaterals(
     parameters.minMarkerPerimeterRate = 4 * smallest_px / max(image.shape)
     parameters.polygonalApproxAccuracyRate = 0.06
     parameters.adaptiveThreshWinSizeMax = 53
-    parameters.adaptiveThreshConstant = 5
+    parameters.adaptiveThreshConstant = 3
     parameters.minMarkerDistanceRate = 0.05
     parameters.detectInvertedMarker = inverted
     big = image if upscale == 1 else cv2.resize(image, None, fx=upscale, fy=upscale, interpolation=cv2.INTER_CUBIC)

@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
@@ -43,12 +44,12 @@ def read_trace(path: Path) -> F64:
 def strokes(trace: F64) -> F64:
     """Return (n, 6): x0, y0, x1, y1 in mm, line energy in s/mm, time in s, of every step with the beam on.
 
-    The power in a row is that of the way to it. Steps in one line at one energy are joined.
+    The power in a row is that of the way from it. Steps in one line at one energy are joined.
     """
     step = np.diff(trace, axis=0)
     length = np.hypot(step[:, 1], step[:, 2])
-    on = (trace[1:, 3] > 0) & (length > JUMP_MM) & (step[:, 0] > 0)
-    energy = trace[1:, 3][on] * step[on, 0] / length[on]
+    on = (trace[:-1, 3] > 0) & (length > JUMP_MM) & (step[:, 0] > 0)
+    energy = trace[:-1, 3][on] * step[on, 0] / length[on]
     raw = np.column_stack([trace[:-1, 1:3][on], trace[1:, 1:3][on], energy, trace[1:, 0][on]])
     joined: list[F64] = []
     for row in raw:
@@ -152,7 +153,14 @@ def _pieces(found: F64) -> F64:
     return np.vstack(parts) if parts else np.empty((0, 5))
 
 
-def burned(grey: F32, share: F32, sheet: Sheet) -> F32:
+def _fallen(solid: NDArray[np.bool_], most_texels: float) -> NDArray[np.bool_]:
+    """Return the pieces cut loose that are small enough to fall through the bed."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(solid.astype(np.uint8), connectivity=4)
+    small = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] < most_texels]
+    return np.isin(labels, small)
+
+
+def burned(grey: F32, share: F32, sheet: Sheet, texel_mm: float) -> F32:
     """Return the sheet's grey values after burning; `share` is fluence over threshold.
 
     How much of a texel is open follows from the logarithm of the fluence and its slope, so edges lie between texels.
@@ -163,6 +171,7 @@ def burned(grey: F32, share: F32, sheet: Sheet) -> F32:
     slope = np.hypot(*np.gradient(level))
     open_share = np.clip(0.5 + level / np.maximum(slope, 1e-3), 0, 1)
     open_share[share < 0.2] = 0
+    open_share[_fallen(open_share < 0.5, sheet.drop_mm2 / texel_mm**2)] = 1
     return np.asarray(charred * (1 - open_share) + sheet.open_frac * open_share, dtype=np.float32)
 
 

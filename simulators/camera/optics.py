@@ -137,7 +137,7 @@ def sheet_texture(scene: Scene, sheet: Sheet, trace: F64, texel_mm: float) -> F3
     found = strokes(trace)
     if not len(found):
         return surface
-    return burned(surface, fluence(on_sheet(found, sheet), sheet.size_mm, texel_mm, sheet.beam), sheet)
+    return burned(surface, fluence(on_sheet(found, sheet), sheet.size_mm, texel_mm, sheet.beam), sheet, texel_mm)
 
 
 def charuco_texture(board: Charuco, texel_mm: float) -> F32:

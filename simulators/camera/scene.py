@@ -60,6 +60,7 @@ class Sheet:
     texture_frac: float = 0.03
     thickness_mm: float = 0.0
     open_frac: float = 0.03  # what is seen through a slit; bright over a light table
+    drop_mm2: float = 100.0  # pieces cut loose fall through the bed when smaller
     beam: Beam = Beam()
 
 

@@ -34,7 +34,7 @@ def trace_of(strokes: list[CutPath], power_frac: float, speed_mm_s: float) -> ND
         for k, point in enumerate(stroke.points_mm):
             step_mm = np.linalg.norm(point - stroke.points_mm[k - 1]) if k else 0.0
             now_s += float(step_mm) / speed_mm_s if k else 0.01
-            rows.append([now_s, *point, power_frac if k else 0.0])
+            rows.append([now_s, *point, power_frac if k < len(stroke.points_mm) - 1 else 0.0])
     return np.array(rows)
 
 
