@@ -1,0 +1,103 @@
+"""`fabctl cut`: cut a design on the laser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+
+
+@click.group("cut", no_args_is_help=True)
+def command() -> None:
+    """Cut a design on the laser."""
+
+
+@command.command("run")
+@click.argument("design", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--material", help="Material file or its name  [the design's own].")
+@click.option(
+    "--origin",
+    type=click.Choice(["home", "here", "camera"]),
+    default="home",
+    show_default=True,
+    help="Where the sheet's corner is: in the corner of the travel, where the head is, or as the camera sees it.",
+)
+@click.option("--camera-file", type=click.Path(dir_okay=False, path_type=Path), help="Sheet to machine map, JSON.")
+@click.option("--frame", is_flag=True, help="Go once around the job first, and ask whether it fits.")
+@click.option("--frame-power", type=click.FloatRange(0, 0.05), default=0.0, help="Beam while framing, at most 5 %.")
+@click.option("--no-home", is_flag=True, help="Trust the position as it is; do not home first.")
+@click.option("--resume", "resume_run", metavar="RUN", help="Go on with an interrupted run of this design.")
+@click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
+@bench_option
+@yes_option
+@json_option
+def run(
+    design: Path,
+    material: str | None,
+    origin: str,
+    camera_file: Path | None,
+    frame: bool,
+    frame_power: float,
+    no_home: bool,
+    resume_run: str | None,
+    dry_run: bool,
+    bench_name: str,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    """Cut the design in folder DESIGN: plan, check, one question, then cut; a run record either way."""
+    from fabctl.bench import open_bench
+    from fabctl.config.bench import load_bench
+    from fabctl.config.material import load_material
+    from fabctl.cut.compose import composer, open_design, sheet_of
+    from fabctl.cut.job import CutOrder, Desk, cut
+    from fabctl.cut.keyboard import HELP, keyboard
+
+    home = lab()
+    bundle, spec = open_design(design)
+    chosen = load_material(material or spec.material, home.root)
+    order = CutOrder(
+        design=design,
+        compose=composer(bundle, spec, chosen),
+        material=chosen,
+        sheet=sheet_of(spec, home.root),
+        origin=origin,  # type: ignore[arg-type]  # click.Choice has checked it
+        camera_file=camera_file,
+        frame=frame,
+        frame_power_frac=frame_power,
+        home=not no_home,
+    )
+    config = load_bench(bench_name, home.root)
+    with open_bench(home, config, f"cut {design.name}") as bench, keyboard() as keys:
+        desk = Desk(lambda question: confirm(question, yes), progress(), keys)
+        if not dry_run:
+            say(HELP)
+        if resume_run is not None:
+            from fabctl.cut.resume import resume
+
+            done = resume(home, bench, order, home.runs / resume_run, desk, dry_run)
+        else:
+            done = cut(home, bench, order, desk, dry_run)
+    facts: dict[str, Any] = {
+        "specimen": done.specimen.name if done.specimen else None,
+        "run": done.run.run_id if done.run else None,
+        "dry_run": dry_run,
+        **done.result,
+    }
+    show(facts, as_json, _lines(facts))
+
+
+def _lines(facts: dict[str, Any]) -> list[str]:
+    from fabctl.cut.execute import minutes
+
+    estimate = minutes(facts["estimate_s"])
+    if facts["run"] is None:
+        return [f"checked: {facts['lines_count']} lines, {facts['burnt_mm'] / 1000:.2f} m burnt, about {estimate}"]
+    return [
+        f"{facts['specimen']} is cut: {facts['burnt_mm'] / 1000:.2f} m in {minutes(facts['actual_s'])} "
+        f"(estimated {estimate})",
+        f"run {facts['run']}",
+    ]

@@ -1,0 +1,60 @@
+"""From a design folder and a material to the program of one cut, with the specimen's id engraved. **W**"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from design.bundle import Bundle, open_bundle
+from design.export.gcode import GcodeOptions
+from design.job import JobOptions, compose_job
+from design.pattern.paths import LAYERS, Layer, LayerPreset
+from design.pattern.toolpath import ToolOptions
+from fabctl.config.loader import load
+from fabctl.config.material import MaterialConfig, load_material
+from fabctl.config.spec import SpecConfig
+from fabctl.cut.job import Compose
+from fabctl.cut.preflight import Sheet
+
+
+def open_design(path: Path) -> tuple[Bundle, SpecConfig]:
+    """Return the design in a folder, checked against its hashes, and its specification."""
+    bundle = open_bundle(path)
+    return bundle, load(bundle.file("spec.yaml"), SpecConfig)
+
+
+def sheet_of(spec: SpecConfig, home: Path) -> Sheet:
+    """Return the sheet that the design was made for."""
+    material = load_material(spec.material, home)
+    return Sheet(material.name, material.thickness_mm)
+
+
+def composer(bundle: Bundle, spec: SpecConfig, material: MaterialConfig) -> Compose:
+    """Return the function that makes the program for a specimen's id and a board's full power."""
+    tool = spec.tool.model_dump(exclude={"kerf_mm", "spread_mm"})
+    kerf_mm = spec.tool.kerf_mm or (material.laser.kerf_mm if material.laser is not None else 0.1)
+    presets = presets_of(material)
+    drawing = bundle.drawing()
+
+    def compose(specimen: str, s_max_count: float) -> tuple[str, ...]:
+        options = JobOptions(
+            tool=ToolOptions(kerf_mm=kerf_mm, **tool),
+            machine=GcodeOptions(s_max_count=s_max_count),
+            spread_mm=spec.tool.spread_mm,
+        )
+        id_text = specimen if drawing.id_anchor is not None else ""
+        return compose_job(drawing, presets, options, id_text).lines
+
+    return compose
+
+
+def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
+    """Return how each layer is cut; holes are cut as the outline is."""
+    laser = material.laser
+    if laser is None:
+        return {layer: LayerPreset(0.0, 1.0) for layer in LAYERS}  # preflight refuses it; nothing is cut with these
+    by_name = {"slit": laser.slit, "outline": laser.outline, "hole": laser.outline}
+    by_name |= {"engrave": laser.engrave, "mark": laser.mark}
+    return {
+        layer: LayerPreset(by_name[layer].power_frac, by_name[layer].feed_mm_s, by_name[layer].passes_count)
+        for layer in LAYERS
+    }
