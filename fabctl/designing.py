@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,15 +40,30 @@ def read_inputs(name: str, home: Path, target: Path | None = None, cell_mm: floa
     Raises `ConfigError`, `UsageError`, `MeshError` or `RefusedError`, each with all that is wrong.
     """
     config, path = load_spec(name, home)
+    return _inputs_of(config, path.read_text(encoding="utf-8"), path.parent, home, target, cell_mm)
+
+
+def _inputs_of(
+    config: SpecConfig, text: str, beside: Path, home: Path, target: Path | None, cell_mm: float | None
+) -> Inputs:
     material = load_material(config.material, home)
     edge_mm = cell_mm or config.cell_mm or material.edge_mm
     sheet = sheet_of(material, edge_mm)
     presets = presets_of(material)
     assert material.laser is not None  # presets_of has refused otherwise
     spec = config.to_design(edge_mm, sheet.hinge_mm, material.laser.kerf_mm)
-    mesh, findings = read_target(config, path, target)
+    mesh, findings = read_target(config, beside, target)
     library = load_library(Path(config.library) if config.library else None).scaled(sheet)
-    return Inputs(spec, path.read_text(encoding="utf-8"), mesh, library, presets, tuple(findings))
+    return Inputs(spec, text, mesh, library, presets, tuple(findings))
+
+
+def inputs_for(target: str, material: str, home: Path, cell_mm: float | None = None) -> Inputs:
+    """Return the inputs for a target alone: a specification, a mesh file, or the name of one of our own surfaces."""
+    if Path(target).suffix in (".yaml", ".yml"):
+        return read_inputs(target, home, cell_mm=cell_mm)
+    source: str | MadeTarget = MadeTarget(make=target) if target in TARGETS else target
+    config = SpecConfig(name=re.sub(r"\W", "-", Path(target).stem) or "target", target=source, material=material)
+    return _inputs_of(config, "", Path.cwd(), home, None, cell_mm)
 
 
 def design_of(inputs: Inputs, emit: Emit = silent) -> Design:
@@ -75,13 +91,13 @@ def build_folder(
     return design, write_bundle(design, inputs.text, folder, replace)
 
 
-def read_target(config: SpecConfig, path: Path, target: Path | None) -> tuple[TriMesh, list[Finding]]:
-    """Return the surface that a specification names; a file is looked for beside the specification first."""
+def read_target(config: SpecConfig, folder: Path, target: Path | None) -> tuple[TriMesh, list[Finding]]:
+    """Return the surface that a specification names; a file is looked for in `folder` first."""
     if target is not None:
         return read_mesh(target)
     if isinstance(config.target, MadeTarget):
         return made(config.target), []
-    beside = path.parent / config.target
+    beside = folder / config.target
     return read_mesh(beside if beside.is_file() else Path(config.target))
 
 

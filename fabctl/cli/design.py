@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from fabctl.cli.common import json_option, lab, progress, say, show
+from fabctl.events import Event
 
 
 @click.group()
@@ -49,3 +50,49 @@ def build(
         )
     findings = [finding.as_dict() for finding in design.findings]
     show({"folder": str(bundle.path), **numbers, "findings": findings}, as_json, lines)
+
+
+@command.command()
+@click.argument("target")
+@click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
+@click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell [the material's].")
+@click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]), default="none", show_default=True,
+              help="What to try where no single sheet fits.")  # fmt: skip
+@click.option("--picture", type=click.Path(path_type=Path), help="PNG of where the surface does not fit.")
+@json_option
+def check(target: str, material: str, cell_mm: float | None, remedy: str, picture: Path | None, as_json: bool) -> None:
+    """Say whether a sheet can become TARGET: a mesh file, a specification, or one of the project's own surfaces."""
+    from design.checking import check as checked
+    from design.checking import misfit_png
+    from fabctl.designing import inputs_for
+    from fabctl.errors import DONE, REFUSED
+
+    listen = progress()
+    inputs = inputs_for(target, material, lab().root, cell_mm)
+
+    def watch(message: str, done_frac: float) -> None:
+        listen(Event("progress", message, done_frac))
+
+    found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, remedy, watch)
+    if picture is not None:
+        picture.write_bytes(misfit_png(inputs.mesh, found.report, inputs.spec.name))
+    findings = [*inputs.findings, *found.findings]
+    for finding in findings:
+        say(str(finding))
+    low, high = found.report.limits.low_ratio, found.report.limits.high_ratio
+    lines = [f"{found.topology}; the library has {low:.3f} to {high:.3f}, a spread of {high / low:.3f}"]
+    for step in found.report.steps:
+        lines.append(
+            f"{step.rung:8} spread {step.spread_ratio:.3f}  {'fits' if step.fits else 'too much'}: {step.detail}"
+        )
+    if found.report.proven_infeasible:
+        lines.append(f"proven: no single sheet without cones can spread by less than {found.report.bound_ratio:.3f}")
+    if found.design is not None:
+        width, height = found.design.drawing.size_mm
+        minutes = found.design.job.time_s / 60
+        cells = len(found.design.cells.wanted_ratio)
+        lines.append(f"the sheet: {cells} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
+    fits = found.design is not None
+    lines.append("it fits" if fits else "it does not fit")
+    show({"target": target, "fits": fits, **found.as_dict()}, as_json, lines)
+    raise click.exceptions.Exit(DONE if fits else REFUSED)
