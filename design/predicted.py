@@ -19,6 +19,8 @@ from design.flatten import Flattening
 from design.pattern.tiling import Array, Tiling
 from design.spec import ResponseOptions
 
+THICKNESS_RATIO = 0.05  # thickness over edge further than that from the computed cells' is told
+
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
@@ -50,7 +52,24 @@ def predict(
         None if options.point_mm is None else np.array(options.point_mm),
         watch=lambda share: watch("pressing the indenter", 0.8 + 0.2 * share),
     )
-    return Predicted(deployed, response, ())
+    return Predicted(deployed, response, tuple(_doubts(library)))
+
+
+def _doubts(library: CellLibrary) -> list[Finding]:
+    """Return what makes the prediction less sure."""
+    computed, sheet = load_bending().sheet, library.sheet
+    asked, known = sheet.thickness_mm / sheet.edge_mm, computed.thickness_mm / computed.edge_mm
+    if abs(asked / known - 1) < THICKNESS_RATIO:
+        return []
+    return [
+        Finding(
+            "DEPLOY-THICKNESS",
+            f"bending stiffness was computed for a thickness of {known:.3g} of the cell's edge; yours is {asked:.3g}, "
+            "and is scaled with the cube of the thickness",
+            "warning",
+            hint="shape and response are less sure; `scripts/build_bending.py` computes the map anew",
+        )
+    ]
 
 
 def layout_of(tiling: Tiling, choice: Choice, library: CellLibrary) -> Layout:
