@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.deploy.levels import Layout, prolong, refine
-from design.deploy.newton import System, solve
+from design.deploy.newton import Equilibrium, System, solve
 from design.deploy.shell import Ints, Reals
+from design.errors import NotConverged
 
 CONTACT_RATIO = 20.0  # stiffness of a contact point over median k_d: it sinks in by a thousandth of a millimetre or so
 SOLVED_COUNT = 1500  # units are divided until the sheet has about this many triangles: the footprint is below a unit
@@ -118,15 +119,15 @@ def indentation_response(
     foot = x[int(np.argmin(x @ way))] if point_mm is None else np.asarray(point_mm, float)
     start = first_contact(x, foot, way, indenter_radius_mm)
     foot = foot + start * way
-    rim = np.repeat(border(fine.cells, fine.vertex_count)[:, None], 3, axis=1)
+    rim = border(fine.cells, fine.vertex_count)
     stiffness = np.full(fine.vertex_count, CONTACT_RATIO * float(np.median(system.shell.dilation_N_mm)))
     depths = np.linspace(0.0, depth_max_mm, steps_count + 1)
     loads: list[float] = []
-    worst, begin = 0.0, x
+    worst, begin, before = 0.0, x, x
     for k, depth in enumerate([*depths, *depths[::-1]]):
         ball = Sphere(foot + (depth - indenter_radius_mm) * way, indenter_radius_mm, stiffness)
-        found = solve(system, x, [ball], rim)
-        x, worst = found.x_mm, max(worst, found.residual_ratio)
+        found = _pressed(system, ball, rim, x, before)
+        x, before, worst = found.x_mm, x, max(worst, found.residual_ratio)
         loads.append(float(ball.force_N(x) @ -way))
         if watch is not None:
             watch((k + 1) / (2 * len(depths)))
@@ -135,6 +136,14 @@ def indentation_response(
     there, again = np.array(loads[:half]), np.array(loads[half:])[::-1]
     point, into = (float(foot[0]), float(foot[1]), float(foot[2])), (float(way[0]), float(way[1]), float(way[2]))
     return Response(depths, there, again, indenter_radius_mm, point, into, worst, back)
+
+
+def _pressed(system: System, ball: Sphere, rim: NDArray[np.bool_], x: Reals, before: Reals) -> Equilibrium:
+    """Return the rest under the sphere, first from where the last two steps point, then from the last."""
+    try:
+        return solve(system, 2 * x - before, [ball], np.repeat(rim[:, None], 3, axis=1), iterations_max=15)
+    except NotConverged:
+        return solve(system, x, [ball], np.repeat(rim[:, None], 3, axis=1))
 
 
 def _on_top_of(source_mm: Reals, goal_mm: Reals, all_mm: Reals) -> Reals:

@@ -23,6 +23,7 @@ TOLERANCE_RATIO = 1e-9  # a tenth of what is promised, max‖force‖ over media
 FIRST_SHIFT_RATIO = 1e-4  # of median k_d; small against any bending mode of one unit
 LONGEST_STEP_RATIO = 0.6  # of a unit's deployed side, per vertex: further than that the quadratic model is fiction
 LINE_SEARCH_STEPS = 30
+SETTLED_RATIO = 1e-5  # of a unit's side: the Hessian changes by about this much over such a step
 
 
 class Load(Protocol):
@@ -197,7 +198,7 @@ def solve(
     stiffness = float(np.median(system.shell.dilation_N_mm))
     first_shift = FIRST_SHIFT_RATIO * stiffness
     longest = LONGEST_STEP_RATIO * system.shell.edge_mm * float(np.mean(system.shell.expansion_ratio))
-    shift = 0.0
+    shift, settled = 0.0, False
     for iteration in range(iterations_max + 1):
         energy, gradient, hessian = system.linearise(x, loads)
         gradient[hold] = 0.0
@@ -206,8 +207,7 @@ def solve(
             watch(iteration, x, residual)
         matrix = system.held(hessian, hold)
         if residual <= tolerance_ratio:
-            negative = factorise(matrix)[1]
-            if negative == 0:
+            if settled or factorise(matrix)[1] == 0:
                 return Equilibrium(x, energy, residual, iteration, 0)
             x = x + _way_down(matrix, gradient.shape, hold) * 0.05 * system.shell.edge_mm
             continue
@@ -226,6 +226,8 @@ def solve(
             shift = max(16 * shift, first_shift)
             continue
         x = x + length * step
+        # A positive factorisation without shift, this near to rest, is that of the rest itself.
+        settled = shift == 0 and length == 1 and float(np.abs(step).max()) < SETTLED_RATIO * system.shell.edge_mm
         shift = shift / 4 if length > 0.5 else shift
         shift = 0.0 if shift < first_shift else shift
     raise NotConverged(
