@@ -136,7 +136,7 @@ def burn() -> list[Figure]:
         found = burnt_against(name, lines)
         worst_mm = max(worst_mm, found.worst_mm)
         missing, extra = missing + found.missing_count, extra + found.extra_count
-        twice = max(twice, abs(found.excess_mm))
+        twice = max(twice, found.excess_mm)
     n = len(JOBS)
     return [
         Figure("burn trace: farthest from the design", round(worst_mm, 4), "mm", "within 0.02 mm", worst_mm <= 0.02, n),

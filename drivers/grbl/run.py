@@ -21,7 +21,7 @@ from drivers.grbl.stream import Stream
 
 POLL_S = 0.1
 ASK_AGAIN_S = 0.3
-STALL_S = 0.9
+STALL_S = 0.8
 IDLE_PROOF_S = 0.25  # Idle seen twice so far apart, with lines unanswered: an answer is lost
 READ_S = 0.01
 END_S = 3.0

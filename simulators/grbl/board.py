@@ -67,6 +67,7 @@ class Board:
         m = self.machine
         m.stepper.halt(m.now_s)
         m.spindle_off()
+        self._note_beam()
         m.state, m.planner.moves = State.IDLE, []
         real = [m.real_mm(k) for k in range(3)]
         m.stepper.stand_at((0, 0, 0))
