@@ -34,10 +34,16 @@ def measure(words: list[str]) -> list[Figure]:
         return _one_size(int(words[1]))
     figures = [figure for name in SPREADS for figure in _published(name)] + _whole_vase()
     figures += _own_targets() + _infeasible()
-    for size in SIZES:
-        if size < 100_000 or "--quick" not in words:
-            figures += _size_in_its_own_process(size)
-    return figures
+    sizes = [size for size in SIZES if size < 100_000 or "--quick" not in words]
+    timed = {size: _size_in_its_own_process(size) for size in sizes}
+    return figures + [figure for size in sizes for figure in timed[size]] + _growth(timed)
+
+
+def _growth(timed: dict[int, list[Figure]]) -> list[Figure]:
+    """Return the power of the vertex count that the time grows with, from the smallest mesh to the largest."""
+    least, most = (timed[size][0] for size in (min(timed), max(timed)))
+    power = float(np.log(most.value / least.value) / np.log(most.n / least.n))
+    return [Figure("time grows with this power of the vertices", power, "", "near linear", power < 1.3, most.n)]
 
 
 def targets_folder() -> Path | None:

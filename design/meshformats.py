@@ -40,19 +40,52 @@ class Soup:
     polygons: list[list[int]] | NDArray[np.int64]
     findings: list[Finding] = field(default_factory=list)
     texture: NDArray[np.float64] | None = None  # (k, 2), OBJ only
-    texture_polygons: list[list[int]] = field(default_factory=list)
+    texture_polygons: list[list[int]] | NDArray[np.int64] = field(default_factory=list)
 
 
 def parse_obj(data: bytes) -> Soup:
     """Return the points and polygons of an OBJ file; `f v`, `v/vt`, `v//vn`, `v/vt/vn` and negative indices."""
     _refuse_binary(data, "OBJ")
+    lines = data.decode("utf-8", errors="replace").replace("\\\n", " ").splitlines()
+    return _obj_at_once(lines) or _obj_line_by_line(lines)
+
+
+def _obj_at_once(lines: list[str]) -> Soup | None:
+    """Return a plain file's contents, ten times as fast; None where any line is out of the ordinary."""
+    sorts = {line.split(None, 1)[0] if line[:1].strip() else "" for line in lines if line.strip()}
+    if not sorts <= {"v", "vt", "vn", "f", "o", "g", "s", "#", "usemtl", "mtllib"}:
+        return None
+    chosen = {
+        sort: [line[len(sort) + 1 :] for line in lines if line.startswith(sort + " ")] for sort in ("v", "vt", "f")
+    }
+    faces = chosen["f"]
+    if not chosen["v"] or not faces:
+        return None
+    corners = len(faces[0].split())
+    kinds = faces[0].count("/") // corners + 1 if "//" not in faces[0] else 2
+    if any(line.count("/") != faces[0].count("/") or line.count("//") != faces[0].count("//") for line in faces):
+        return None
+    try:
+        points = np.loadtxt(chosen["v"], ndmin=2)
+        texture = np.loadtxt(chosen["vt"], ndmin=2) if chosen["vt"] else None
+        table = np.loadtxt([line.replace("/", " ") for line in faces], dtype=np.int64, ndmin=2)
+    except ValueError:
+        return None
+    if table.shape[1] != corners * kinds or (table <= 0).any() or points.shape[1] not in (3, 6):
+        return None
+    soup = Soup(points[:, :3], table[:, ::kinds] - 1)
+    if texture is not None and texture.shape[1] >= 2 and kinds > 1 and "//" not in faces[0]:
+        soup.texture, soup.texture_polygons = texture[:, :2], table[:, 1::kinds] - 1
+    return soup
+
+
+def _obj_line_by_line(lines: list[str]) -> Soup:
     points: list[list[float]] = []
     texture: list[list[float]] = []
     polygons: list[list[int]] = []
     texture_polygons: list[list[int]] = []
     bad_lines: list[int] = []
-    text = data.decode("utf-8", errors="replace").replace("\\\n", " ")
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(lines, start=1):
         words = line.split()
         if not words:
             continue

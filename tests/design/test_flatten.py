@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from design.errors import FlattenError
 from design.flatten import FlattenOptions, flatten
-from design.flatten.quality import crossings, distortion, signed_areas_mm2
+from design.flatten.quality import check_flat, crossings, distortion, signed_areas_mm2
 from design.meshfiles import read_corner_uv, read_mesh
 from design.surface import TriMesh, boundary_loops, tidy
 from design.targets import TARGETS, cap, freeform, pierced_cap, saddle
@@ -188,3 +188,18 @@ def test_prescribed_rims_of_holes_get_the_lengths_asked_for() -> None:
     lengths = [np.linalg.norm(np.diff(v[hole], axis=0), axis=1) for v in (again.flat_mm, mesh.vertices_mm)]
     asked = np.exp(0.5 * (start.u[hole[1:]] + start.u[hole[:-1]]))
     np.testing.assert_allclose(lengths[0] / lengths[1], asked, rtol=0.02)
+
+
+def test_a_flipped_face_is_counted_and_an_anisotropic_stretch_measured() -> None:
+    mesh = saddle(height_mm=0, edge_mm=15)
+    flat_mm = mesh.vertices_mm[:, :2] * [1.5, 1.0]
+    measured = distortion(mesh, flat_mm, mesh.faces)
+    assert measured.mean_ratio == pytest.approx(1.5)
+    assert measured.max_ratio == pytest.approx(1.5)
+    assert len(measured.flipped) == 0
+    flat_mm[0] += [60, 60]  # the middle, thrown over its neighbours
+    flipped = np.flatnonzero(signed_areas_mm2(flat_mm, mesh.faces) < 0)
+    assert len(flipped) > 0
+    np.testing.assert_array_equal(distortion(mesh, flat_mm, mesh.faces).flipped, flipped)
+    codes = {finding.code for finding in check_flat(mesh, flat_mm, mesh.faces, boundary_loops(mesh))}
+    assert "FLAT-FLIPPED" in codes

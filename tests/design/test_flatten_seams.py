@@ -13,6 +13,7 @@ from design.errors import FlattenError
 from design.flatten import Flattening, FlattenOptions, flatten
 from design.flatten.cut import cut_along, shortest_chain
 from design.flatten.quality import distortion
+from design.flatten.tube import tube, tube_scale_factors
 from design.meshfiles import read_mesh, weld
 from design.surface import TriMesh, boundary_loops, check_target
 from design.targets import TARGETS, cap, cylinder, double_bump, hemisphere, pierced_cap, revolve, vase
@@ -40,6 +41,7 @@ def test_a_cylinder_unrolls_into_its_rectangle() -> None:
     assert seam.translation_mm == pytest.approx((around_mm, 0))
     assert np.ptp(flat.flat_mm[:, 1]) == pytest.approx(90, rel=2e-3)
     assert flat.spread_ratio() == pytest.approx(1, abs=1e-6)
+    assert distortion(opened(flat), flat.flat_mm, flat.faces).max_ratio == pytest.approx(1, abs=1e-6)
 
 
 @pytest.mark.parametrize("boundary", ["isometric", "optimised"])
@@ -63,10 +65,22 @@ def test_a_vase_of_revolution_has_the_spread_of_its_profile() -> None:
     assert flatten(mesh).spread_ratio() == pytest.approx(radius_mm.max() / radius_mm.min(), rel=0.005)
 
 
-def test_an_uneven_tube_re_joins_too() -> None:
+def uneven_tube() -> TriMesh:
     mesh = vase(edge_mm=5)
     x, y, z = mesh.vertices_mm.T
-    bent = TriMesh(np.column_stack([x * (1 + 0.003 * z) + 0.002 * z**2, 0.8 * y + 0.1 * x, z + 0.1 * x]), mesh.faces)
+    return TriMesh(np.column_stack([x * (1 + 0.003 * z) + 0.002 * z**2, 0.8 * y + 0.1 * x, z + 0.1 * x]), mesh.faces)
+
+
+@pytest.mark.parametrize("boundary", ["isometric", "optimised"])
+def test_neither_end_of_a_tube_turns_in_total(boundary: str) -> None:
+    mesh = uneven_tube()
+    surface = tube(mesh, boundary_loops(mesh), "cotangent")
+    u = tube_scale_factors(surface, FlattenOptions(boundary=boundary))  # type: ignore[arg-type]
+    assert [float(turning.sum()) for turning in surface.turning(u)] == pytest.approx([0, 0], abs=1e-9)
+
+
+def test_an_uneven_tube_re_joins_too() -> None:
+    bent = uneven_tube()
     flat = flatten(bent, FlattenOptions(boundary="optimised"))
     plain = flatten(bent)
     assert flat.seams[0].gap_mm < 1e-9

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from design.errors import MeshError, UnreadableMesh
 from design.meshfiles import read_corner_uv, read_mesh, read_triangles, write_mesh, write_ply
+from design.meshformats import parse_obj
 from design.surface import TriMesh, check_target
 from design.targets import cap
 
@@ -185,3 +186,27 @@ def test_the_published_targets_are_sound(shared: Path, name: str) -> None:
     mesh, found = read_mesh(shared / "published" / "targets" / f"{name}.obj")
     assert found == []
     assert check_target(mesh) == []
+
+
+@pytest.mark.parametrize("form", ["{0}", "{0}/{0}", "{0}//{0}", "{0}/{0}/{0}"])
+def test_the_quick_and_the_patient_reading_of_obj_agree(form: str) -> None:
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in CAP.vertices_mm.tolist()]
+    lines += [f"vt {x!r} {y!r}" for x, y, _ in CAP.vertices_mm.tolist()]
+    lines += ["vn 0 0 1"] * len(CAP.vertices_mm)
+    lines += ["f " + " ".join(form.format(corner) for corner in face) for face in (CAP.faces + 1).tolist()]
+    quick, patient = parse_obj("\n".join(lines).encode()), parse_obj("\n".join([*lines, " # patiently"]).encode())
+    np.testing.assert_array_equal(quick.points, patient.points)
+    np.testing.assert_array_equal(quick.polygons, patient.polygons)
+    assert isinstance(quick.polygons, np.ndarray)
+    assert isinstance(patient.polygons, list)
+    assert (quick.texture is None) == (patient.texture is None)
+    if quick.texture is not None:
+        np.testing.assert_array_equal(quick.texture_polygons, patient.texture_polygons)
+
+
+@pytest.mark.parametrize("odd", ["f 1 2 3 4", "f -1 -2 -3", "f 1/1 2/1 3/1", "v 1 2", "f 1 2 x", "curv 0 1"])
+def test_an_odd_line_is_not_passed_over(odd: str) -> None:
+    lines = ["v 0 0 0", "v 50 0 0", "v 0 50 0", "v 50 50 1", "vt 0 0", "f 1 2 3", odd]
+    soup = parse_obj("\n".join(lines).encode())
+    assert isinstance(soup.polygons, list)
+    assert [finding.code for finding in soup.findings] == (["FILE-LINE"] if odd in ("v 1 2", "f 1 2 x") else [])
