@@ -21,6 +21,9 @@ MODELS = {
     "material": "fabctl.config.material:MaterialConfig",
     "method": "fabctl.config.method:MethodConfig",
     "rig": "fabctl.config.rig:RigMapConfig",
+    "spec": "fabctl.config.spec:SpecConfig",
+    "method": "fabctl.config.method:MethodConfig",
+    "rig": "fabctl.config.rig:RigMapConfig",
 }
 
 

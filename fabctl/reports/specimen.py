@@ -12,7 +12,7 @@ from fabctl.records.folder import RunFolder, sha256, status_of
 from fabctl.reports.design_step import cut_step, design_step
 from fabctl.reports.indent_step import indent_step
 from fabctl.reports.model import Fact, Provenance, Report, Step, Word
-from fabctl.reports.scan import scan_step
+from fabctl.reports.scan import TITLE, scan_step
 from fabctl.reports.view3d import script
 from fabctl.workspace import Specimen, Workspace
 
@@ -71,8 +71,8 @@ def verdict(latest: dict[str, RunFolder]) -> tuple[Word, str, list[str]]:
 def _keys(steps: Sequence[Step], latest: dict[str, RunFolder]) -> Iterator[Fact]:
     facts = {(step.title, fact.label): fact for step in steps for fact in step.facts}
     wanted = (
-        ("Scan against target", "RMS deviation"),
-        ("Scan against target", "95 % of the area within"),
+        (TITLE, "rms"),
+        (TITLE, "within ±1.00%"),
         ("Indentation", "secant stiffness"),
         ("Indentation", "largest force"),
         ("Design", "cells"),
