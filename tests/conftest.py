@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+pytest_plugins = ["fabctl.testing"]  # what a lab's own tests get by installing the package
 ROOT = Path(__file__).resolve().parents[1]
 
 

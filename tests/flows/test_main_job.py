@@ -33,7 +33,7 @@ def test_design_cut_indent_scan_and_report_agree_with_the_answer_key(simulated_b
     measured, predicted = found["indent"]["stiffness_secant_N_mm"], found["indent"]["predicted_secant_N_mm"]
     assert measured == pytest.approx(predicted, rel=0.1)
     # the scan: the scale the scanner hid is found
-    keys = [json.loads(p.read_text()) for p in (home / "bench-state/sim/truth").glob("*scan*.json")]
+    keys = [json.loads(p.read_text()) for p in (home / "bench-state/sim/truth").glob("scan-truth.json")]
     assert len(keys) == 1
     assert found["scan"]["pose"]["unit_mm"] == pytest.approx(1 / keys[0]["scale_ratio"], rel=0.005)
     assert found["verdict"] == "pass"
