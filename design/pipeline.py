@@ -27,7 +27,7 @@ from design.predicted import Predicted, predict
 from design.spec import DesignSpec
 from design.surface import TriMesh
 
-SCALE_ROUNDS_COUNT = 12
+SCALE_ROUNDS_COUNT = 24
 SCALE_MARGIN_RATIO = 2e-4  # kept from the end of the library, so that cells come to lie just inside it
 PUBLISHED_HIGH_RATIO = 1.75  # what the published pipeline scales the greatest expansion to
 
@@ -163,15 +163,20 @@ def scaled(
         place, misfit = best_place(flat.flat_mm, flat.faces, spec.cell_mm)
         found.append(Finding("TILE-FIT", f"flat and cells differ on {misfit:.1%} of the flat's area", "info"))
     flat = replace(flat, flat_mm=place.put(flat.flat_mm))
-    for _ in range(SCALE_ROUNDS_COUNT):
+    fits: list[tuple[float, Flattening, Tiling, Array]] = []
+    for done_count in range(SCALE_ROUNDS_COUNT):
         tiling = tile(flat.flat_mm, flat.faces, spec.cell_mm, place.shift_mm)
         wanted = averaged(tiling, flat.flat_mm, flat.faces, flat.expansion_ratio**2, spec.averaging)
         change = factor(float(wanted.min()), float(wanted.max()), room, spec.scale)
+        if low <= wanted.min() and wanted.max() <= high:
+            fits.append((abs(change - 1), flat, tiling, wanted))
         if abs(change - 1) < SCALE_MARGIN_RATIO or wanted.max() / wanted.min() > high / low:
             break
-        flat = flat.scaled(1 / change)
-    if wanted.min() < low or wanted.max() > high:
+        # Border cells that come and go with the scale can make whole steps alternate for ever; half steps end that.
+        flat = flat.scaled(1 / (change if done_count < SCALE_ROUNDS_COUNT // 2 else change**0.5))
+    if not fits:
         raise OutOfLibrary(float(wanted.min()), float(wanted.max()), (low, high), found)
+    _, flat, tiling, wanted = min(fits, key=lambda fit: fit[0])
     return flat, tiling.compact(), wanted
 
 
