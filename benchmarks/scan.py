@@ -29,7 +29,7 @@ from design.surface import TriMesh
 from fabctl.scan.clean import clean
 from fabctl.scan.deviation import deviate
 from fabctl.scan.markers import scale_from_board
-from fabctl.scan.register import Registration, register
+from fabctl.scan.register import Registration, Task, register
 from fabctl.scan.similarity import IDENTITY, Similarity
 from fabctl.scan.symmetry import Symmetries, find_symmetries
 from fabctl.scan.target import Target
@@ -83,9 +83,7 @@ def true_pose(made: Scan) -> Similarity:
 
 def registered(case: Case, made: Scan, seed: int, scale_ratio: float | None = None) -> Registration:
     """Return what the program makes of the scan."""
-    return register(
-        made.points, clean(made.points, seed), case.target, case.symmetries, scale_ratio=scale_ratio, seed=seed
-    )
+    return register(Task(made.points, clean(made.points, seed), case.target, case.symmetries, scale_ratio, seed=seed))
 
 
 def outcome(case: Case, plan: ScanPlan) -> Outcome:

@@ -67,6 +67,7 @@ class Cleaned:
 
     cells: Cells
     table: Plane | None
+    table_top_cu: float  # what is lower is called table
     is_table: Mask  # (n,), of the points
     sparse: Mask  # (m,), of the cells
     cluster: Ints  # (m,), -1 where sparse or empty after the table left
@@ -144,21 +145,22 @@ def find_table(cells: Cells, seed: int) -> Plane | None:
     return Plane(normal, offset, spread)
 
 
-def on_table(points: Floats, table: Plane, size: float) -> Mask:
-    """Return which points belong to the table, or lie under it; `size` is the cell's."""
+def table_top_cu(points: Floats, table: Plane, size: float) -> float:
+    """Return the height up to which a point may belong to the table: four times its scatter; `size` is the cell's."""
     height = table.height(points)
     near = np.abs(height) < 2 * size
     some = height[near][:: max(1, int(near.sum()) // 50_000)]
     core = some[np.abs(some) < max(6 * table.spread_cu, 0.5 * size)]
     spread = 1.4826 * float(np.median(np.abs(core))) if len(core) else table.spread_cu
-    return np.asarray(height < 4.0 * spread)
+    return 4.0 * spread
 
 
 def clean(points: Floats, seed: int = 0) -> Cleaned:
     """Return the cloud told apart; `points` as read, `(n, 3)`."""
     cells = into_cells(points)
     table = find_table(cells, seed)
-    is_table = np.zeros(len(points), dtype=bool) if table is None else on_table(points, table, cells.size_cu)
+    top = 0.0 if table is None else table_top_cu(points, table, cells.size_cu)
+    is_table = np.zeros(len(points), dtype=bool) if table is None else table.height(points) < top
     left = np.bincount(cells.of_point[(cells.of_point >= 0) & ~is_table], minlength=len(cells.count))
     standing = left >= np.maximum(1, 0.3 * cells.count)
     usual = float(np.median(cells.around[standing])) if standing.any() else 0.0
@@ -167,7 +169,7 @@ def clean(points: Floats, seed: int = 0) -> Cleaned:
     core = standing & ~sparse
     cluster[core] = _clusters(cells.centre[core], JOIN_CELLS * cells.size_cu)
     parts = tuple(_parts(cells, cluster, table is not None))
-    return Cleaned(cells, table, is_table, sparse, cluster, parts)
+    return Cleaned(cells, table, top, is_table, sparse, cluster, parts)
 
 
 def _clusters(points: Floats, reach: float) -> Ints:

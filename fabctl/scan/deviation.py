@@ -208,7 +208,7 @@ def bootstrap(fit: Fit, target: Target, seed: int, *, free_scale: bool, still: F
         A, b = (J * w[:, None]).T @ J, -(J * w[:, None]).T @ r
         if fit.rim is not None:
             pick = rng.integers(len(fit.rim.residual), size=len(fit.rim.residual))
-            Jr, v = fit.rim.jacobian[pick], fit.rim_weight[pick] / fit.rim.spread[0] ** 2
+            Jr, v = fit.rim.jacobian[pick], fit.rim_weight[pick] / (fit.rim.reach_frac / 8) ** 2
             e = fit.rim.residual[pick] - np.median(fit.rim.residual)
             A, b = A + (Jr * v[:, None]).T @ Jr, b - (Jr * v[:, None]).T @ e
         if not free_scale:

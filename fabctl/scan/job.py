@@ -19,9 +19,10 @@ from fabctl.scan.clean import Cleaned, clean
 from fabctl.scan.cloud import Cloud, read_cloud, read_labelled, write_csv, write_ply
 from fabctl.scan.colours import colours_of, span_mm
 from fabctl.scan.deviation import Deviation, Statistics, Uncertainty, bootstrap, deviate, statistics
+from fabctl.scan.judge import Judged
 from fabctl.scan.markers import Scale, scale_from_board
 from fabctl.scan.refine import Options, refine
-from fabctl.scan.register import FINAL_POINTS, Datums, Judged, Registration, register
+from fabctl.scan.register import FINAL_POINTS, Datums, Registration, Task, register
 from fabctl.scan.symmetry import Symmetries, find_symmetries
 from fabctl.scan.target import Target
 
@@ -115,16 +116,9 @@ def compare(request: Request, emit: Emit = silent) -> Comparison:
     cleaned = clean(cloud.points, request.seed)
     emit(Event("stage", "looking for the target's own symmetries"))
     symmetries = find_symmetries(target)
-    registration = register(
-        cloud.points,
-        cleaned,
-        target,
-        symmetries,
-        scale_ratio=None if scale is None else scale.unit_mm,
-        datums=read_datums(request),
-        seed=request.seed,
-        emit=emit,
-    )
+    known = None if scale is None else scale.unit_mm
+    task = Task(cloud.points, cleaned, target, symmetries, known, read_datums(request), request.seed, emit)
+    registration = register(task)
     made = Comparison(request, target, cloud, cleaned, registration, scale)
     findings = [*cloud.findings, *registration.findings]
     if registration.status not in ("aligned", "symmetric") or registration.best is None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fabctl.scan.foreign import nearest
+from fabctl.scan.rim import REACH_FIRST_FRAC, REACH_FRAC, Rest, Rim, rim_rows
 from fabctl.scan.similarity import Similarity, rotation_of
 from fabctl.scan.target import Target
 
@@ -29,9 +30,6 @@ PATCHES = 800
 LEAST_IN_PATCH = 6
 TUKEY = 4.685  # 95 % efficient for normal noise
 FLOOR_FRAC = 2e-5  # of the diagonal; below it a patch's residual is rounding, not shape
-RIM_REACH_FRAC = 0.05  # of the diagonal; how far from the border points may tell where the cloud's edge is
-RIM_REACH_FIRST_FRAC = 0.14  # likewise in the first step, while the surface may still have to slide
-RIM_QUANTILE = 0.96
 SLID_FRAC = 1e-3  # of the diagonal; a step this small ends the sliding
 SLIDING_SIGMA_FRAC = 2e-3  # while sliding, patches hold no tighter than this and the rim pulls with its median
 GROW_LIMIT_RATIO = 0.05
@@ -58,7 +56,7 @@ class Fit:
 
     pose: Similarity  # cloud as read -> target, mm
     patches: Rows
-    rim: Rows | None
+    rim: Rim | None
     weight: Floats  # of each patch, 0 to 1
     rim_weight: Floats
     patch_sigma_frac: float  # robust spread of patch residuals, of the diagonal
@@ -78,30 +76,31 @@ class Options:
     still_frac: float = 1e-5  # of the diagonal; a smaller step ends the work
     band_frac: float = 0.05  # of the diagonal; farther points are not compared at first
     free: tuple[bool, bool, bool, bool, bool, bool] = (True,) * 6  # turn and shift about/along the target's axes
+    rest: Rest | None = None  # the table, where there is one
     still: Floats | None = None  # (7,), a motion that nothing can tell: the turn of a surface of revolution
 
 
 def refine(points: Floats, start: Similarity, target: Target, options: Options = Options()) -> Fit:
     """Return the fit of the cloud's `points` (n, 3), as read, from the pose `start`, which must be near."""
-    pose, band, reach = start, options.band_frac, RIM_REACH_FIRST_FRAC
+    pose, band, reach = start, options.band_frac, REACH_FIRST_FRAC
     patch_tree = _patch_tree(target)
     moved = np.inf
     steps_count = 0
     while steps_count < options.steps_count:
         steps_count += 1
         rows = patch_rows(points, pose, target, patch_tree, band) if options.use_patches else _no_rows()
-        rim = rim_rows(points, pose, target, reach) if options.use_rim else None
-        sliding = reach > RIM_REACH_FRAC
+        rim = rim_rows(points, pose, target, reach, options.rest) if options.use_rim else None
+        sliding = reach > REACH_FRAC
         x, weight, rim_weight, sigma = solve(rows, rim, options, sliding=sliding)
         moved = float(np.linalg.norm(x[:3]) * 0.5 + np.linalg.norm(x[3:6]) + 0.5 * abs(x[6]))
         pose = moved_by(pose, x, target)
         band = max(0.6 * band, 0.02, 12 * sigma)
         if sliding and (moved < SLID_FRAC or steps_count >= options.steps_count // 2):
-            reach = RIM_REACH_FRAC
+            reach = REACH_FRAC
         elif moved < options.still_frac:
             break
     rows = patch_rows(points, pose, target, patch_tree, band) if options.use_patches else _no_rows()
-    rim = rim_rows(points, pose, target, RIM_REACH_FRAC) if options.use_rim else None
+    rim = rim_rows(points, pose, target, REACH_FRAC, options.rest) if options.use_rim else None
     _, weight, rim_weight, sigma = solve(rows, rim, options, sliding=False)
     return Fit(pose, rows, rim, weight, rim_weight, sigma, steps_count, moved)
 
@@ -172,54 +171,7 @@ def patch_medians(values: Floats, patch: Ints, count: int) -> Floats:
     return middle
 
 
-def rim_rows(points: Floats, pose: Similarity, target: Target, reach_frac: float = RIM_REACH_FRAC) -> Rows | None:
-    """Return one equation for each stretch of border near which the cloud has an edge, or None without a border.
-
-    The edge is a high quantile of how far out the points near that stretch lie; where the cloud ends well inside
-    there is none, and holes elsewhere do not matter.
-    """
-    border, size = target.border, target.diagonal_mm
-    if border is None:
-        return None
-    placed = pose(points)
-    distance, at = nearest(cKDTree(border.points_mm), placed, reach_frac * size)
-    near = np.isfinite(distance)
-    placed, at = placed[near], at[near]
-    gap = placed - border.points_mm[at]
-    level = np.abs(np.sum(gap * border.normals[at], axis=1)) < 0.4 * reach_frac * size
-    gap, at = gap[level], at[level]
-    # Stretches: neighbouring samples together, so that each holds enough points for a quantile.
-    stretch_of = _stretches(border.points_mm, max(8, min(120, len(gap) // 40)))
-    stretch = stretch_of[at]
-    out = np.sum(gap * border.outward[at], axis=1) / size
-    count = np.bincount(stretch, minlength=stretch_of.max() + 1)
-    order = np.lexsort((out, stretch))
-    ends = np.searchsorted(stretch[order], np.arange(len(count) + 1))
-    used = np.flatnonzero(count >= 25)
-    if len(used) < 6:
-        return None
-    edge = out[order][ends[used] + (RIM_QUANTILE * (count[used] - 1)).astype(int)]
-    places = np.stack([_mean_by(border.points_mm[:, k], stretch_of)[used] for k in range(3)], axis=1)
-    outward = np.stack([_mean_by(border.outward[:, k], stretch_of)[used] for k in range(3)], axis=1)
-    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-12)
-    share = np.bincount(stretch_of)[used] / len(stretch_of)
-    J = jacobian((places - target.centre_mm) / size, outward)
-    return Rows(J, edge, share, np.full(len(used), reach_frac / 8))
-
-
-def _stretches(points: Floats, count: int) -> Ints:
-    """Return for each border sample the number of its stretch."""
-    from fabctl.scan.nearest import farthest_order
-
-    centres = points[farthest_order(points, count)]
-    return nearest(cKDTree(centres), points)[1]
-
-
-def _mean_by(values: Floats, group: Ints) -> Floats:
-    return np.asarray(np.bincount(group, values) / np.maximum(np.bincount(group), 1))
-
-
-def solve(rows: Rows, rim: Rows | None, options: Options, *, sliding: bool) -> tuple[Floats, Floats, Floats, float]:
+def solve(rows: Rows, rim: Rim | None, options: Options, *, sliding: bool) -> tuple[Floats, Floats, Floats, float]:
     """Return the motion, the weights of patches and of rim stretches, and the patches' robust spread.
 
     Weights begin with the median fit (1/|r|) and narrow to Tukey's about the spread found, which is re-estimated, so
@@ -227,15 +179,15 @@ def solve(rows: Rows, rim: Rows | None, options: Options, *, sliding: bool) -> t
     """
     weight, rim_weight = np.ones(len(rows.residual)), np.ones(0 if rim is None else len(rim.residual))
     sigma = rim_sigma = 0.0
-    x = np.zeros(8)
+    x = np.zeros(7)
     rounds = 1 if options.weighting == "least-squares" else 25
     for k in range(rounds + 1):
         x = _least_squares(rows, rim, weight, rim_weight, max(sigma, 1e-6), max(rim_sigma, 1e-4), options)
         r = rows.residual + rows.jacobian @ x[:7]
         sigma = _spread(r) if len(r) else 0.0
         if rim is not None:
-            e = rim.residual + rim.jacobian @ x[:7] - x[7]
-            rim_weight, rim_sigma = _rim_weights(e, float(rim.spread[0]), sliding)
+            e = rim.residual + rim.jacobian @ x[:7] - x[7:][rim.loop]
+            rim_weight, rim_sigma = _rim_weights(e, rim.reach_frac / 8, sliding)
             sigma = max(sigma, SLIDING_SIGMA_FRAC) if sliding else sigma
         if options.weighting == "least-squares" or k == rounds:
             break
@@ -257,6 +209,29 @@ def _rim_weights(e: Floats, limit_frac: float, sliding: bool) -> tuple[Floats, f
     return np.where(e > 0, sigma / np.maximum(e, sigma), _tukey(e, 3.0 * sigma)), sigma
 
 
+def weak_motions(fit: Fit, target: Target, options: Options, limit_frac: float) -> list[Floats]:
+    """Return the motions (7,) that the surface itself does not hold to `limit_frac` of the diagonal, each of unit size.
+
+    The size of a motion is its rms displacement of the target. What is weak here is held by the rim alone, if at all.
+    Patches share errors with their neighbours, so their information is taken three times less sure than it looks.
+    """
+    arms = target.search.grid.points[:400]
+    moves = np.stack([np.concatenate([np.cross(np.eye(3)[k], a) for a in arms]) for k in range(3)], axis=1)
+    shifts = np.tile(np.eye(3), (len(arms), 1))
+    D = np.concatenate([moves, shifts, arms.reshape(-1, 1)], axis=1) / np.sqrt(len(arms))
+    sigma = max(fit.patch_sigma_frac, 3e-4)
+    H = (fit.patches.jacobian * fit.weight[:, None]).T @ fit.patches.jacobian / (3 * sigma) ** 2
+    basis = np.eye(7)[:, [k for k in range(7) if k < 6 or options.free_scale]]
+    if options.still is not None:
+        kept = basis - np.outer(options.still, options.still @ basis)
+        u, values, _ = np.linalg.svd(kept, full_matrices=False)
+        basis = u[:, values > 1e-6]
+    metric = basis.T @ D.T @ D @ basis
+    root = np.linalg.inv(np.linalg.cholesky(metric + 1e-12 * np.eye(len(metric)))).T
+    values, vectors = np.linalg.eigh(root.T @ basis.T @ H @ basis @ root)
+    return [np.asarray(basis @ root @ vectors[:, k]) for k in np.flatnonzero(values < 1 / limit_frac**2)]
+
+
 def _spread(residual: Floats) -> float:
     return float(1.4826 * np.median(np.abs(residual - np.median(residual))))
 
@@ -266,19 +241,20 @@ def _tukey(residual: Floats, width: Floats | float) -> Floats:
 
 
 def _least_squares(
-    rows: Rows, rim: Rows | None, weight: Floats, rim_weight: Floats, sigma: float, rim_sigma: float, options: Options
+    rows: Rows, rim: Rim | None, weight: Floats, rim_weight: Floats, sigma: float, rim_sigma: float, options: Options
 ) -> Floats:
-    """Return the eight unknowns: motion, log scale, and the rim's common offset."""
+    """Return the unknowns: motion, log scale, and the offset of each loop of the rim."""
     w = weight * rows.area * max(len(rows.area), 1) / sigma**2
-    A, b = np.zeros((8, 8)), np.zeros(8)
+    n = 7 if rim is None else 7 + len(rim.slack_frac)
+    A, b = np.zeros((n, n)), np.zeros(n)
     A[:7, :7] = (rows.jacobian * w[:, None]).T @ rows.jacobian
     b[:7] = -(rows.jacobian * w[:, None]).T @ rows.residual
     if rim is not None:
-        J = np.concatenate([rim.jacobian, -np.ones((len(rim.residual), 1))], axis=1)
+        J = np.concatenate([rim.jacobian, -np.eye(n - 7)[rim.loop]], axis=1)
         v = rim_weight / rim_sigma**2
         A += (J * v[:, None]).T @ J
         b -= (J * v[:, None]).T @ rim.residual
-    A[7, 7] += 1 / 0.01**2
+        A[range(7, n), range(7, n)] += 1 / rim.slack_frac**2
     fixed = [k for k in range(6) if not options.free[k]] + ([] if options.free_scale else [6])
     A[fixed, :], A[:, fixed], b[fixed] = 0.0, 0.0, 0.0
     A[fixed, fixed] = 1.0

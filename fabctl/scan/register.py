@@ -2,28 +2,29 @@
 
 Search globally, refine what survives, judge every pose on the same measure in both directions, and compare the best
 with all others modulo the target's own symmetries. A pose within `RIVAL_RATIO` of the best that no symmetry explains
-makes the answer ambiguous; points that a person or a marker gives may then decide.
+makes the answer ambiguous; points that a person or a marker gives may then decide. Where the surface itself hardly
+holds the pose, it is pushed along those motions and must come back.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from design.findings import Finding
 from fabctl.events import Emit, Event, silent
 from fabctl.scan.clean import Cleaned, Part
 from fabctl.scan.coarse import search, search_cloud
-from fabctl.scan.foreign import nearest, spacing_of
-from fabctl.scan.refine import Fit, Options, refine
+from fabctl.scan.judge import Judged, judge, thin
+from fabctl.scan.refine import Options, moved_by, refine, weak_motions
+from fabctl.scan.rim import Rest
 from fabctl.scan.similarity import Similarity
-from fabctl.scan.symmetry import Symmetries, find_mirrors
-from fabctl.scan.target import Target
+from fabctl.scan.symmetry import Symmetries, find_mirrors, spin_angle
+from fabctl.scan.target import Closest, Target
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -33,54 +34,16 @@ SEARCH_POINTS = 4000
 FIT_POINTS = 8_000  # for judging poses; the chosen one is refined with FINAL_POINTS
 FINAL_POINTS = 150_000
 DENSE_POINTS = 60_000
-KEEP_CLOUD_FRAC, KEEP_TARGET_FRAC = 0.92, 0.7  # the rest is held at its edge: outliers, and what was not seen
-EXPLAINED_FRAC = 0.025  # of the diagonal; a point nearer to the target than this is explained by the pose
-WORST_RMS_FRAC = 0.02
-LEAST_COVERAGE_FRAC, LEAST_EXPLAINED_FRAC = 0.45, 0.75
-SURE_RMS_FRAC, SURE_COVERAGE_FRAC, SURE_EXPLAINED_FRAC = 0.008, 0.55, 0.88
+JUDGE_POINTS = 4000
+CANDIDATES = 6
+LEAST_MEMBERS = 200
 MIRROR_BETTER_RATIO = 0.7
 MIRROR_DOUBT_FRAC = 0.005
-SAME_POSE_FRAC = 0.006
+SAME_POSE_FRAC = 0.004
+HELD_FRAC = 0.002  # of the diagonal; a motion that the surface does not hold to this is tried
+PUSHES_FRAC = (-0.04, -0.015, 0.015, 0.04)
 
 Status = Literal["aligned", "symmetric", "ambiguous", "failed", "mirrored"]
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """A refined pose and how well it fits, all as fractions of the diagonal or of a whole."""
-
-    fit: Fit
-    cloud_rms_frac: float
-    target_rms_frac: float
-    coverage_frac: float  # of the target's area, with a point near it
-    explained_frac: float  # of the part's points, near the target
-    relation: str = "found by the search"
-
-    @property
-    def pose(self) -> Similarity:
-        """Return the map from the cloud as read to the target, mm."""
-        return self.fit.pose
-
-    @property
-    def score_frac(self) -> float:
-        """Return one number for the fit in both directions; less is better."""
-        return float(np.hypot(self.cloud_rms_frac, self.target_rms_frac) / np.sqrt(2))
-
-    def plausible(self) -> bool:
-        """Return whether the cloud can be a scan of the target in this pose at all."""
-        return (
-            max(self.cloud_rms_frac, self.target_rms_frac) < WORST_RMS_FRAC
-            and self.coverage_frac > LEAST_COVERAGE_FRAC
-            and self.explained_frac > LEAST_EXPLAINED_FRAC
-        )
-
-    def sure(self) -> bool:
-        """Return whether the fit is so good that other parts of the cloud need not be tried."""
-        return (
-            max(self.cloud_rms_frac, self.target_rms_frac) < SURE_RMS_FRAC
-            and self.coverage_frac > SURE_COVERAGE_FRAC
-            and self.explained_frac > SURE_EXPLAINED_FRAC
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,149 +69,145 @@ class Datums:
     target_mm: Floats  # (k, 3)
 
 
-def thin(points: Floats, count: int, seed: int) -> Floats:
-    """Return about `count` points spread evenly over the cloud's surface, in random order."""
-    if len(points) <= count:
-        return points[np.random.default_rng(seed).permutation(len(points))]
-    low = points.min(axis=0)
-    size = float(np.linalg.norm(np.ptp(points, axis=0))) / 40
-    for _ in range(12):
-        index = ((points - low) / size).astype(np.int64)
-        side = index.max() + 2
-        _, first = np.unique((index[:, 0] * side + index[:, 1]) * side + index[:, 2], return_index=True)
-        if 0.8 * count <= len(first) <= 1.5 * count:
-            break
-        size *= float(np.clip(np.sqrt(len(first) / (1.1 * count)), 0.3, 3.0))
-    picked = np.random.default_rng(seed).permutation(first)[:count]
-    return np.asarray(points[picked])
+@dataclass(frozen=True)
+class Task:
+    """What is to be registered, and what is known beforehand; `scale_ratio` is mm per cloud unit where it is known."""
+
+    points: Floats  # (n, 3), the cloud as read
+    cleaned: Cleaned
+    target: Target
+    symmetries: Symmetries
+    scale_ratio: float | None = None
+    datums: Datums | None = None
+    seed: int = 0
+    emit: Emit = field(default=silent)
+
+    @property
+    def options(self) -> Options:
+        """Return how poses are refined."""
+        table = self.cleaned.table
+        return Options(
+            free_scale=self.scale_ratio is None,
+            still=self.symmetries.still(self.target),
+            rest=None if table is None else Rest(table, self.cleaned.table_top_cu),
+        )
 
 
-def judge(fit: Fit, points: Floats, dense: Floats, target: Target, relation: str = "found by the search") -> Judged:
-    """Return how well the fit lays the even samples `points` on the target, and the target on `dense`."""
-    size = target.diagonal_mm
-    placed = fit.pose(points)
-    away = np.linalg.norm(placed - target.closest(placed).points_mm, axis=1) / size
-    grid = target.search
-    samples = grid.grid.points[:3000]
-    image = (fit.pose(dense) - target.centre_mm) / size
-    tree = cKDTree(image)
-    distance, at = nearest(tree, samples)
-    reach = max(3 * spacing_of(tree, image[:2000]), 0.012)
-    near = distance < reach
-    across = np.abs(np.sum((image[at] - samples) * grid.normals[:3000], axis=1))
-    back = np.where(near, across, distance)
-    return Judged(
-        fit,
-        _held_rms(away, KEEP_CLOUD_FRAC),
-        _held_rms(back, KEEP_TARGET_FRAC),
-        float(near.mean()),
-        float((away < EXPLAINED_FRAC).mean()),
-        relation,
-    )
+@dataclass(frozen=True)
+class Body:
+    """The points of one part of the cloud, thinned once for all poses that are tried with it."""
+
+    part: Part
+    even: Floats
+    dense: Floats
 
 
-def _held_rms(values: Floats, keep_frac: float) -> float:
-    return float(np.sqrt(np.mean(np.minimum(values, np.quantile(values, keep_frac)) ** 2)))
+def body_of(task: Task, part: Part) -> Body | None:
+    """Return the points of the part, or None where there are too few."""
+    members = task.points[_members(task.cleaned, part)]
+    if len(members) < LEAST_MEMBERS:
+        return None
+    return Body(part, thin(members, FIT_POINTS, task.seed), members[:: max(1, len(members) // DENSE_POINTS)])
 
 
-def poses_for_part(
-    points: Floats, target: Target, symmetries: Symmetries, scale_ratio: float | None, seed: int, *, mirrored: bool
-) -> list[Judged]:
-    """Return the refined, distinct poses (modulo symmetry) of these points of the cloud, the best first.
+def tried(task: Task, body: Body, start: Similarity, relation: str = "found by the search") -> Judged:
+    """Return the pose refined from `start`, and judged."""
+    fit = refine(body.even, start, task.target, task.options)
+    return judge(fit, body.even[:JUDGE_POINTS], body.dense, task.target, relation)
 
-    `scale_ratio` is mm per cloud unit where that is known.
-    """
-    cloud = search_cloud(thin(points, SEARCH_POINTS, seed), mirrored=mirrored)
-    size = target.diagonal_mm
-    known = None if scale_ratio is None else scale_ratio / (size * cloud.entering.scale_ratio)
+
+def poses_of(task: Task, body: Body, *, mirrored: bool = False) -> list[Judged]:
+    """Return the refined poses of the body that differ by more than a symmetry, the best first."""
+    cloud = search_cloud(thin(body.even, SEARCH_POINTS, task.seed), mirrored=mirrored)
+    target, size = task.target, task.target.diagonal_mm
+    known = None if task.scale_ratio is None else task.scale_ratio / (size * cloud.entering.scale_ratio)
     found = search(cloud, target.search, known)
     leaving = Similarity(np.eye(3), target.centre_mm, size)
-    even, dense = thin(points, FIT_POINTS, seed), points[:: max(1, len(points) // DENSE_POINTS)]
-    options = Options(free_scale=scale_ratio is None, still=symmetries.still(target))
     score = found.score()
     judged: list[Judged] = []
-    for k in np.flatnonzero(score < max(2.2 * score[0], score[0] + 0.004))[:6]:
-        start = leaving.after(Similarity(found.rotation[k], found.shift[k], float(found.scale_ratio[k])))
-        start = start.after(cloud.entering)
-        if any(symmetries.apart_frac(start, j.pose, target) < SAME_POSE_FRAC / 2 for j in judged):
-            continue
-        fit = refine(even, start, target, options)
-        judged.append(judge(fit, even[:4000], dense, target))
-    judged.sort(key=lambda j: j.score_frac)
+    for k in np.flatnonzero(score < max(2.2 * score[0], score[0] + 0.004))[:CANDIDATES]:
+        turn = Similarity(found.rotation[k], found.shift[k], float(found.scale_ratio[k]))
+        start = leaving.after(turn).after(cloud.entering)
+        if all(task.symmetries.apart_frac(start, j.pose, target) > SAME_POSE_FRAC / 2 for j in judged):
+            judged.append(tried(task, body, start))
+    return _distinct(task, judged)
+
+
+def _distinct(task: Task, judged: list[Judged]) -> list[Judged]:
     kept: list[Judged] = []
-    for one in judged:
-        if all(symmetries.apart_frac(one.pose, other.pose, target) > SAME_POSE_FRAC for other in kept):
+    for one in sorted(judged, key=lambda j: j.score_frac):
+        if all(task.symmetries.apart_frac(one.pose, other.pose, task.target) > SAME_POSE_FRAC for other in kept):
             kept.append(one)
     return kept
 
 
-def register(
-    points: Floats,
-    cleaned: Cleaned,
-    target: Target,
-    symmetries: Symmetries,
-    *,
-    scale_ratio: float | None = None,
-    datums: Datums | None = None,
-    seed: int = 0,
-    emit: Emit = silent,
-) -> Registration:
-    """Return the pose of the cloud (n, 3) on the target, or why there is none; same input and seed, same answer."""
-    tried: list[tuple[Part, list[Judged]]] = []
-    for part in cleaned.parts:
-        members = _members(cleaned, part)
-        if members.sum() < 200:
+def pushed(task: Task, body: Body, best: Judged) -> list[Judged]:
+    """Return where the best pose goes when it is pushed along the motions that the surface hardly holds."""
+    weak = weak_motions(best.fit, task.target, task.options, HELD_FRAC)
+    return [
+        tried(task, body, moved_by(best.pose, push * motion, task.target), "pushed along a weak motion")
+        for motion in weak
+        for push in PUSHES_FRAC
+    ]
+
+
+def register(task: Task) -> Registration:
+    """Return the pose of the cloud on the target, or why there is none; same input and seed, same answer."""
+    fits: list[tuple[Body, list[Judged]]] = []
+    for part in task.cleaned.parts:
+        body = body_of(task, part)
+        if body is None:
             continue
-        emit(Event("stage", f"aligning: {part.name}, {int(members.sum())} points"))
-        found = poses_for_part(points[members], target, symmetries, scale_ratio, seed, mirrored=False)
-        tried.append((part, found))
+        task.emit(Event("stage", f"aligning: {part.name}"))
+        found = poses_of(task, body)
+        fits += [(body, found)] if found else []
         if found and found[0].sure():
             break
-    tried = [(part, found) for part, found in tried if found]
-    if not tried:
+    if not fits:
         finding = Finding("SCAN-EMPTY", "nothing in the cloud can be the specimen", hint="is the file the right one?")
-        none = np.zeros(len(points), dtype=bool)
-        return Registration("failed", None, (), None, none, symmetries, (finding,))
-    part, found = min(tried, key=lambda t: (not t[1][0].plausible(), _merit(t[1][0])))
+        none = np.zeros(len(task.points), dtype=bool)
+        return Registration("failed", None, (), None, none, task.symmetries, (finding,))
+    body, found = min(fits, key=lambda t: (not t[1][0].plausible(), _merit(t[1][0])))
+    if found[0].score_frac > MIRROR_DOUBT_FRAC or not found[0].plausible():
+        image, proper = _mirrored(task, body, found[0])
+        if image is not None and proper is None:
+            return _finished(task, "mirrored", image, (), body)
+        found = _distinct(task, [*found, proper]) if proper is not None else found
+    if not found[0].plausible():
+        return _finished(task, "failed", found[0], (), body)
+    found = _distinct(task, [*found, *pushed(task, body, found[0])])
+    return _decided(task, body, found)
+
+
+def _decided(task: Task, body: Body, found: list[Judged]) -> Registration:
+    """Return the answer from the distinct poses, the best first."""
     best = found[0]
-    if best.score_frac > MIRROR_DOUBT_FRAC or not best.plausible():
-        emit(Event("stage", "aligning: the mirror image, to see whether it fits better"))
-        body = points[_members(cleaned, part)]
-        image = poses_for_part(body, target, symmetries, scale_ratio, seed, mirrored=True)
-        if image and image[0].plausible() and image[0].score_frac < MIRROR_BETTER_RATIO * best.score_frac:
-            unmirrored = _unmirrored(image[0], body, target, symmetries, scale_ratio, seed)
-            if unmirrored is None:
-                best = replace(image[0], relation="mirror image")
-                return _finished("mirrored", best, (), part, points, cleaned, symmetries, target, scale_ratio)
-            best, found = unmirrored, [unmirrored, *found]
-    if not best.plausible():
-        return _finished("failed", best, (), part, points, cleaned, symmetries, target, scale_ratio)
-    members = _members(cleaned, part)
-    even = thin(points[members], FIT_POINTS, seed)
     rivals = [j for j in found[1:] if j.score_frac <= RIVAL_RATIO * best.score_frac]
-    turned = list(_symmetric(best, even, points[members], target, symmetries, scale_ratio))
-    if datums is not None:
-        chosen, by_datum = decide_by_datums([best, *turned, *rivals], datums, target, symmetries)
-        if by_datum:
-            others = tuple(j for j in [best, *turned, *rivals] if j is not chosen and j.pose is not chosen.pose)
-            return _finished(
-                "aligned", chosen, others, part, points, cleaned, symmetries, target, scale_ratio, "datum points"
-            )
-    status: Status = "ambiguous" if rivals else "symmetric" if turned or symmetries.continuous else "aligned"
-    return _finished(status, best, (*turned, *rivals), part, points, cleaned, symmetries, target, scale_ratio)
+    turned = list(_symmetric(task, body, best))
+    if task.datums is not None:
+        chosen, single = decide_by_datums([best, *turned, *rivals], task.datums, task.target, task.symmetries)
+        if single:
+            others = tuple(j for j in (best, *turned, *rivals) if j.fit.patches is not chosen.fit.patches)
+            return _finished(task, "aligned", chosen, others, body, "datum points")
+    turns = bool(turned) or task.symmetries.continuous
+    status: Status = "ambiguous" if rivals else "symmetric" if turns else "aligned"
+    return _finished(task, status, best, (*turned, *rivals), body)
 
 
-def _unmirrored(
-    image: Judged, members: Floats, target: Target, symmetries: Symmetries, scale_ratio: float | None, seed: int
-) -> Judged | None:
-    """Return the proper pose that the mirrored one amounts to where the target is its own mirror image, else None."""
-    mirrors = find_mirrors(target, symmetries)
+def _mirrored(task: Task, body: Body, best: Judged) -> tuple[Judged | None, Judged | None]:
+    """Return the mirror image's pose where it fits much better, and the proper pose it amounts to, if there is one.
+
+    A target that is its own mirror image turns a mirrored pose into a proper one that the search had missed.
+    """
+    task.emit(Event("stage", "aligning: the mirror image, to see whether it fits better"))
+    image = poses_of(task, body, mirrored=True)
+    better = image and image[0].plausible() and image[0].score_frac < MIRROR_BETTER_RATIO * best.score_frac
+    if not better:
+        return None, None
+    mirrors = find_mirrors(task.target, task.symmetries)
     if not mirrors:
-        return None
-    even, dense = thin(members, FIT_POINTS, seed), members[:: max(1, len(members) // DENSE_POINTS)]
-    options = Options(free_scale=scale_ratio is None, still=symmetries.still(target))
-    fit = refine(even, mirrors[0].motion.after(image.pose), target, options)
-    return judge(fit, even[:4000], dense, target)
+        return replace(image[0], relation="mirror image"), None
+    return image[0], tried(task, body, mirrors[0].motion.after(image[0].pose))
 
 
 def _merit(judged: Judged) -> float:
@@ -263,21 +222,11 @@ def _members(cleaned: Cleaned, part: Part) -> Mask:
     return held if "plane kept" in part.name else held & ~cleaned.is_table
 
 
-def _symmetric(
-    best: Judged,
-    even: Floats,
-    dense: Floats,
-    target: Target,
-    symmetries: Symmetries,
-    scale_ratio: float | None,
-) -> Iterator[Judged]:
+def _symmetric(task: Task, body: Body, best: Judged) -> Iterator[Judged]:
     """Yield the pose under every symmetry of the target, refined and judged in its own right."""
-    options = Options(free_scale=scale_ratio is None, still=symmetries.still(target))
-    for symmetry in symmetries.turns:
-        fit = refine(even, symmetry.motion.after(best.pose), target, options)
-        found = judge(
-            fit, even[:4000], dense[:: max(1, len(dense) // DENSE_POINTS)], target, f"symmetry: {symmetry.describe()}"
-        )
+    for symmetry in task.symmetries.turns:
+        start = symmetry.motion.after(best.pose)
+        found = tried(task, body, start, f"symmetry: {symmetry.describe()}")
         if found.score_frac <= RIVAL_RATIO * best.score_frac:
             yield found
 
@@ -300,8 +249,6 @@ def decide_by_datums(
 
 def spun_to(judged: Judged, datums: Datums, symmetries: Symmetries) -> Judged:
     """Return the pose turned about the axis of revolution so that the datum points fit best."""
-    from fabctl.scan.symmetry import spin_angle
-
     if symmetries.axis_point_mm is None or symmetries.axis_direction is None:
         return judged
     angle = spin_angle(judged.pose(datums.cloud), datums.target_mm, symmetries.axis_point_mm, symmetries.axis_direction)
@@ -309,51 +256,55 @@ def spun_to(judged: Judged, datums: Datums, symmetries: Symmetries) -> Judged:
 
 
 def _finished(
+    task: Task,
     status: Status,
     best: Judged,
     alternatives: tuple[Judged, ...],
-    part: Part,
-    points: Floats,
-    cleaned: Cleaned,
-    symmetries: Symmetries,
-    target: Target,
-    scale_ratio: float | None,
+    body: Body,
     decided_by: str = "geometry",
 ) -> Registration:
-    specimen = specimen_points(points, cleaned, part, best.pose, target)
+    specimen = specimen_points(task, body.part, best.pose)
     if status in ("aligned", "symmetric") and specimen.sum() > 500:
-        options = Options(free_scale=scale_ratio is None, still=symmetries.still(target))
-        chosen = points[specimen]
-        final = refine(chosen[:: max(1, len(chosen) // FINAL_POINTS)], best.pose, target, options)
+        chosen = task.points[specimen]
+        final = refine(chosen[:: max(1, len(chosen) // FINAL_POINTS)], best.pose, task.target, task.options)
         best = replace(best, fit=final)
-        specimen = specimen_points(points, cleaned, part, best.pose, target)
-    findings = tuple(_findings(status, best, alternatives, cleaned, symmetries, target))
-    return Registration(status, best, alternatives, part, specimen, symmetries, findings, decided_by)
+        specimen = specimen_points(task, body.part, best.pose)
+    findings = tuple(_findings(task, status, best, alternatives))
+    return Registration(status, best, alternatives, body.part, specimen, task.symmetries, findings, decided_by)
 
 
-def specimen_points(points: Floats, cleaned: Cleaned, part: Part, pose: Similarity, target: Target) -> Mask:
+def specimen_points(task: Task, part: Part, pose: Similarity) -> Mask:
     """Return which points are the specimen, given the pose: dense cells near the target, table left out."""
+    cleaned, target = task.cleaned, task.target
     band_mm = 0.05 * target.diagonal_mm
     cells = cleaned.cells
     near = np.zeros(len(cells.count), dtype=bool)
     dense = ~cleaned.sparse
     placed = pose(cells.centre[dense])
-    away = np.linalg.norm(placed - target.closest(placed).points_mm, axis=1)
-    near[dense] = away < band_mm
-    held = np.zeros(len(points), dtype=bool)
+    found = target.closest(placed)
+    near[dense] = np.linalg.norm(placed - found.points_mm, axis=1) < band_mm
+    if cleaned.table is not None and "plane kept" not in part.name:
+        near[dense] &= ~_too_low(found, pose, cleaned)
+    held = np.zeros(len(task.points), dtype=bool)
     inside = cells.of_point >= 0
     held[inside] = (near & ((cleaned.cluster >= 0) | part.cells))[cells.of_point[inside]]
     return held if "plane kept" in part.name else held & ~cleaned.is_table
 
 
-def _findings(
-    status: Status,
-    best: Judged,
-    alternatives: tuple[Judged, ...],
-    cleaned: Cleaned,
-    symmetries: Symmetries,
-    target: Target,
-) -> Iterator[Finding]:
+def _too_low(found: Closest, pose: Similarity, cleaned: Cleaned) -> Mask:
+    """Return where the target lies so near to the table that only points with upward noise were kept as specimen.
+
+    There the scan would seem to deviate upwards. The more level the surface, the more of the noise is upwards.
+    """
+    assert cleaned.table is not None
+    back = pose.inverse()
+    height = cleaned.table.height(back(found.points_mm))
+    level = np.abs((found.normals @ pose.rotation) @ cleaned.table.normal)
+    return np.asarray(height < cleaned.table_top_cu * (1 + 0.9 * level))
+
+
+def _findings(task: Task, status: Status, best: Judged, alternatives: tuple[Judged, ...]) -> Iterator[Finding]:
+    cleaned, symmetries, target = task.cleaned, task.symmetries, task.target
     if status == "failed":
         yield Finding(
             "SCAN-NO-FIT",

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from design.surface import TriMesh
 from fabctl.scan.foreign import open3d
@@ -152,6 +154,7 @@ class Border:
     outward: Floats  # (k, 3)
     along: Floats  # (k, 3)
     normals: Floats  # (k, 3)
+    loop: Ints  # (k,), which closed loop of the border
     spacing_mm: float
 
 
@@ -186,4 +189,19 @@ def _border(target: Target) -> Border | None:
     normal = np.cross(b - a, opposite - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     outward = np.cross(along, normal)
-    return Border(a[which] + step * (b - a)[which], outward[which], along[which], normal[which], spacing)
+    return Border(
+        a[which] + step * (b - a)[which],
+        outward[which],
+        along[which],
+        normal[which],
+        _loops(target, face, corner)[which],
+        spacing,
+    )
+
+
+def _loops(target: Target, face: Ints, corner: Ints) -> Ints:
+    """Return for each border edge the number of the closed loop it belongs to."""
+    f, n = target.mesh.faces, len(target.mesh.vertices_mm)
+    a, b = f[face, (corner + 1) % 3], f[face, (corner + 2) % 3]
+    _, label = connected_components(coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(n, n)), directed=False)
+    return np.asarray(np.unique(label[a], return_inverse=True)[1], dtype=np.int64)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fabctl.scan.clean import clean
-from fabctl.scan.register import Datums, Registration, register
+from fabctl.scan.register import Datums, Registration, Task, register
 from simulators.photogrammetry import ScanPlan
 from tests.fabctl.scan.conftest import TARGETS, scanned, symmetries_of, true_pose
 
@@ -16,7 +16,7 @@ RAW = ScanPlan(seed=3, unseen_frac=0.3, points_count=20_000)
 def registered(name: str, plan: ScanPlan, datums: Datums | None = None) -> Registration:
     made = scanned(name, plan)
     cleaned = clean(made.points, plan.seed)
-    return register(made.points, cleaned, TARGETS[name], symmetries_of(name), datums=datums, seed=plan.seed)
+    return register(Task(made.points, cleaned, TARGETS[name], symmetries_of(name), datums=datums, seed=plan.seed))
 
 
 def error_frac(name: str, plan: ScanPlan, found: Registration) -> float:
@@ -54,5 +54,5 @@ def test_a_mirror_image_is_named() -> None:
 
 def test_an_unrelated_cloud_is_refused() -> None:
     made = scanned("cap", RAW)
-    found = register(made.points, clean(made.points), TARGETS["freeform"], symmetries_of("freeform"), seed=0)
+    found = register(Task(made.points, clean(made.points), TARGETS["freeform"], symmetries_of("freeform")))
     assert found.status == "failed"
