@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from design.cells import homogenise
 from design.cells.geometry import strip_mm
 from design.cells.homogenise import Cell, Failure, Pair
-from design.cells.library import CellLibrary
+from design.cells.library import CellLibrary, energy_scale_mJ
 from design.cells.mesh import REFERENCE, Density
 from design.cells.sheet import Sheet
 
@@ -141,8 +141,8 @@ def columns_of(cells: list[Cell]) -> tuple[Array, Array, Array]:
 
 def interpolated(table: Published, library: CellLibrary) -> tuple[Array, Array, Array]:
     """Return expansion, stiffness and barrier of the rows read off the library's map."""
-    cells = library.at(table.t_mm, table.theta_rad)
-    return cells.expansion_ratio, cells.stiffness_mJ, cells.barrier_mJ
+    cells, scale = library.at(table.t_mm, table.theta_rad), energy_scale_mJ(library.sheet)
+    return cells.expansion_ratio, cells.stiffness_mJ / scale, cells.barrier_mJ / scale
 
 
 def compared(

@@ -47,6 +47,9 @@ class Cell:
     stored_mm2: float | None = None  # energy at P5
     stiffness_mm2: float | None = None
     nu_tangent_ratio: float | None = None
+    open_ratio: float | None = None  # open cells: the expansion of the slit cell they are cut as
+    overlap_frac: float | None = None  # open cells: material lying on material once closed
+    curve_mm2: list[float] | None = None  # energy of the even stretch at CURVE_SHARES, for some cells
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +130,21 @@ def _ahead(a: State, b: State) -> State:
     )
 
 
+CURVE_SHARES = np.linspace(0.0, 1.12, 29)  # of the way from flat to the second stable state
+
+
+def even_curve_mm2(m: Model, pair: Pair) -> list[float] | None:
+    """Return the energy per hexagon of the even stretch at CURVE_SHARES, or None where a point did not converge."""
+    state = relax(m, m.rest, 1.0)
+    energies = [SECTORS * state.energy_mm2]
+    for share in CURVE_SHARES[1:]:
+        state = _held(m, state, 1 + float(share) * (pair.stable.s_ratio - 1))
+        if not state.converged:
+            return None
+        energies.append(SECTORS * state.energy_mm2)
+    return energies
+
+
 GUESS_DRIFT_RATIO = 0.02  # a root further than this from its guess may be another branch
 
 
@@ -154,28 +172,30 @@ def is_pair(pair: Pair) -> bool:
         is_stable(stable)
         and saddle.converged
         and index == 1
-        and 1 < saddle.s_ratio < stable.s_ratio
+        and 0 < (saddle.s_ratio - 1) / (stable.s_ratio - 1) < 1
         and saddle.energy_mm2 > stable.energy_mm2
     )
 
 
 def follow(m: Model, reach_ratio: float) -> Pair | Failure:
-    """Return the pair found by stretching from rest up to `reach_ratio`."""
+    """Return the pair found by stretching from rest up to `reach_ratio`, or by closing down to it where below one."""
+    sign = 1 if reach_ratio > 1 else -1
     last = relax(m, m.rest, 1.0)
-    least = math.inf  # of dE/ds where it dips
+    least = math.inf  # of the slope along the path where it dips
     saddle: State | None = None
-    while last.s_ratio < reach_ratio:
-        state = _next(m, last)
+    while sign * last.s_ratio < sign * reach_ratio:
+        state = _next(m, last, sign)
         if isinstance(state, Failure):
             return state
-        if saddle is None and state.slope <= 0:
+        rise, before = sign * state.slope, sign * last.slope
+        if saddle is None and rise <= 0 < before:
             saddle = _crossing(m, last, state)
         elif saddle is None and last.curve_total < 0 < state.curve_total:
-            low = _least_slope(m, last, state)
-            least = min(least, low.slope)
-            if low.slope < 0:
+            low = _least_slope(m, last, state, sign)
+            least = min(least, sign * low.slope)
+            if sign * low.slope < 0:
                 return _pair(_crossing(m, last, low), _crossing(m, low, state))
-        elif saddle is not None and state.slope >= 0:
+        elif saddle is not None and rise >= 0:
             return _pair(saddle, _crossing(m, last, state))
         last = state
     where = f"up to the stretch {reach_ratio:.3f}"
@@ -187,30 +207,30 @@ def follow(m: Model, reach_ratio: float) -> Pair | Failure:
     return Failure("not bistable", f"dE/ds keeps rising {where}", last.residual_ratio)
 
 
-def _next(m: Model, last: State) -> State | Failure:
+def _next(m: Model, last: State, sign: int = 1) -> State | Failure:
     """Return the equilibrium one step further, by smaller steps where the first is too bold."""
-    step = STEP_RATIO
+    step = sign * STEP_RATIO
     while True:
         state = relax(m, last.y + step * last.drift, last.s_ratio + step)
         if state.converged:
             return state
         step /= 4
-        if step < SMALLEST_STEP_RATIO:
+        if abs(step) < SMALLEST_STEP_RATIO:
             return Failure(
                 "not converged", f"no equilibrium at the stretch {last.s_ratio + step:.4f}", state.residual_ratio
             )
 
 
-def _least_slope(m: Model, a: State, b: State) -> State:
-    """Return about where dE/ds is least between two states whose curvatures have opposite signs, or below zero."""
-    best = a if a.slope < b.slope else b
+def _least_slope(m: Model, a: State, b: State, sign: int) -> State:
+    """Return about where the path's slope is least between two states of opposite curvature, or is negative."""
+    best = min(a, b, key=lambda state: sign * state.slope)
     for _ in range(8):
         share = a.curve_total / (a.curve_total - b.curve_total)
         mid = _held(m, a, a.s_ratio + float(np.clip(share, 0.1, 0.9)) * (b.s_ratio - a.s_ratio))
         if not mid.converged:
             break
-        best = mid if mid.slope < best.slope else best
-        if best.slope < 0 or b.s_ratio - a.s_ratio < SMALLEST_STEP_RATIO:
+        best = min(best, mid, key=lambda state: sign * state.slope)
+        if sign * best.slope < 0 or abs(b.s_ratio - a.s_ratio) < SMALLEST_STEP_RATIO:
             break
         a, b = (mid, b) if mid.curve_total < 0 else (a, mid)
     return best
@@ -222,18 +242,19 @@ def _held(m: Model, near: State, s_ratio: float) -> State:
 
 def _crossing(m: Model, a: State, b: State) -> State:
     """Return the root of dE/ds between two states where it has opposite signs: Newton, kept inside by halving."""
-    falls = a.slope > 0
+    falls = (a.slope > 0) == (b.s_ratio > a.s_ratio)  # seen in the direction of growing s: the saddle
     found = a
     for _ in range(12):
         start = a if abs(a.slope) < abs(b.slope) else b
         found = root(m, start.y, start.s_ratio)
-        inside = a.s_ratio - SMALLEST_STEP_RATIO <= found.s_ratio <= b.s_ratio + SMALLEST_STEP_RATIO
+        low, high = sorted((a.s_ratio, b.s_ratio))
+        inside = low - SMALLEST_STEP_RATIO <= found.s_ratio <= high + SMALLEST_STEP_RATIO
         if found.converged and inside and (found.curve_total < 0) == falls:
             return found
         mid = _held(m, a, 0.5 * (a.s_ratio + b.s_ratio))
         if not mid.converged:
             break
-        a, b = (mid, b) if (mid.slope > 0) == falls else (a, mid)
+        a, b = (mid, b) if mid.slope * a.slope > 0 else (a, mid)
     return found
 
 

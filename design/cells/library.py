@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import io
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.cells.geometry import SQRT3
-from design.cells.homogenise import Cell
+from design.cells.homogenise import CURVE_SHARES, Cell
 from design.cells.interpolate import Grid, grid_of
 from design.cells.sheet import Sheet
 from design.cells.sweep import Plan
@@ -29,8 +30,10 @@ from design.errors import DesignError
 Array = NDArray[np.float64]
 FORMAT = 1
 SHIPPED = Path(__file__).parent / "data" / "library.npz"
+SHIPPED_OPEN = SHIPPED.with_name("library-open.npz")
 VERDICTS = ("bistable", "not bistable", "invalid", "not converged")
 NUMBERS = ("expansion_ratio", "saddle_ratio", "barrier_mm2", "stored_mm2", "stiffness_mm2", "nu_tangent_ratio")
+OPEN_NUMBERS = ("open_ratio", "overlap_frac")
 
 
 class LibraryError(DesignError):
@@ -49,6 +52,18 @@ class CellProperties:
     Y_N_mm: Array
     nu_tangent_ratio: Array
     inside: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class EnergyCurve:
+    """Energy and force of the even stretch of one hexagonal cell, (n,) each."""
+
+    stretch_ratio: Array
+    energy_mJ: Array
+    force_mJ: Array  # dE/ds
+
+
+_P5 = int(np.argmin(np.abs(CURVE_SHARES - 1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +111,38 @@ class CellLibrary:
             np.isfinite(lam),
         )  # fmt: skip
 
+    def energy_curve(self, t_mm: float, theta_rad: float) -> EnergyCurve:
+        """Return the energy of one cell's even stretch, from flat past its second stable state.
+
+        The shape is blended from the nearest kept curves (every tenth cell of each column); its height at the saddle
+        and at the second state is that of the map. Raises `LibraryError` outside the map.
+        """
+        here = self.at(t_mm, theta_rad)
+        if not here.inside:
+            raise LibraryError(f"no bistable cell at t = {t_mm:g} mm, θ = {math.degrees(theta_rad):g}°")
+        stored_mm2 = float(self._read("stored_mm2", t_mm, theta_rad))
+        rows, curves = self.table["curve_row"].astype(int), self.table["curve_mm2"]
+        away = np.hypot(
+            (self.table["t_mm"][rows] - t_mm) / self.sheet.edge_mm, self.table["theta_rad"][rows] - theta_rad
+        )
+        near = np.argsort(away, kind="stable")[:4]
+        weights = 1 / (away[near] + 1e-9)
+        barrier, stored = self.table["barrier_mm2"][rows[near]], self.table["stored_mm2"][rows[near]]
+        # Before the saddle the height is that of the saddle, behind it the well is measured from its own floor.
+        scale, total = energy_scale_mJ(self.sheet), np.zeros(curves.shape[1])
+        top = float(here.barrier_mJ) / scale + stored_mm2
+        for k, w in zip(range(len(near)), weights / weights.sum(), strict=True):
+            curve, peak = curves[near[k]], barrier[k] + stored[k]
+            climb = curve * top / peak
+            well = stored_mm2 + (curve - stored[k]) * (top - stored_mm2) / barrier[k]
+            total += w * np.where(np.arange(len(curve)) <= np.argmax(curve[: _P5 + 1]), climb, well)
+        stretch = 1 + CURVE_SHARES * (float(here.expansion_ratio) - 1)
+        return EnergyCurve(stretch, total * scale, np.gradient(total * scale, stretch))
+
+    def _read(self, name: str, t_mm: float, theta_rad: float) -> float:
+        grid = grid_of(self.table["t_mm"], self.table["theta_rad"], self.table[name][None], self.sheet)
+        return float(grid(np.array([t_mm]), np.array([theta_rad]))[0, 0])
+
     def scaled(self, sheet: Sheet) -> CellLibrary:
         """Return the library for a sheet of the same slit/edge, hinge/edge and ν: lengths and energies only scale."""
         mine, asked = shape_of(self.sheet), shape_of(sheet)
@@ -137,9 +184,13 @@ def table_of(cells: Sequence[Cell]) -> tuple[dict[str, Array], list[str]]:
         "reason": np.array([float(place[c.reason]) for c in cells]),
         "residual_ratio": np.array([c.residual_ratio for c in cells]),
     }
-    for name in NUMBERS:
+    is_open = any(c.open_ratio is not None for c in cells)
+    for name in (*NUMBERS, *(OPEN_NUMBERS if is_open else ())):
         values = (getattr(c, name) for c in cells)
         table[name] = np.array([np.nan if value is None else value for value in values], dtype=float)
+    kept = [k for k, c in enumerate(cells) if c.curve_mm2 is not None]
+    table["curve_row"] = np.array(kept, dtype=float)
+    table["curve_mm2"] = np.array([cells[k].curve_mm2 for k in kept], dtype=float).reshape(-1, len(CURVE_SHARES))
     return table, reasons
 
 

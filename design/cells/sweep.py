@@ -12,14 +12,14 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from design.cells import homogenise
+from design.cells import homogenise, open_cells
 from design.cells.geometry import t_bounds_mm
 from design.cells.homogenise import Cell, Failure, Pair
 from design.cells.mesh import REFERENCE, Density
@@ -27,9 +27,23 @@ from design.cells.sheet import Sheet
 
 Array = NDArray[np.float64]
 
+Kind = Literal["slit", "open"]  # cut as slits and expanding, or cut as holes and closing
+
 THETA_LIMIT_RAD = math.pi / 6
 LEAST_T_RATIO = 0.05  # of the edge: the published map begins here
-SOURCES = ("geometry", "mesh", "elements", "kernels", "sector", "tiling", "tangent", "homogenise", "sweep")
+CURVE_EVERY = 10  # cells of a column between two whose energy curve is kept
+SOURCES = (
+    "geometry",
+    "mesh",
+    "elements",
+    "kernels",
+    "sector",
+    "tiling",
+    "tangent",
+    "homogenise",
+    "open_cells",
+    "sweep",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +57,7 @@ class Plan:
     theta_count: int = 43
     t_step_mm: float = 0.01
     density: Density = REFERENCE
+    kind: Kind = "slit"
 
     @property
     def sheet(self) -> Sheet:
@@ -55,9 +70,15 @@ class Plan:
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-def plan_of(sheet: Sheet, theta_count: int = 43, t_step_mm: float = 0.01, density: Density = REFERENCE) -> Plan:
+def plan_of(
+    sheet: Sheet,
+    theta_count: int = 43,
+    t_step_mm: float = 0.01,
+    density: Density = REFERENCE,
+    kind: Kind = "slit",
+) -> Plan:
     """Return the plan for a sheet; the default is the paper's resolution, 7,552 candidates on its sheet."""
-    return Plan(sheet.edge_mm, sheet.slit_mm, sheet.hinge_mm, sheet.nu_ratio, theta_count, t_step_mm, density)
+    return Plan(sheet.edge_mm, sheet.slit_mm, sheet.hinge_mm, sheet.nu_ratio, theta_count, t_step_mm, density, kind)
 
 
 def solver_hash() -> str:
@@ -86,16 +107,26 @@ def solve_column(plan: Plan, theta_rad: float) -> list[Cell]:
     """Return the cells of one column; each starts from the secant through the two before it where that holds."""
     cells: list[Cell] = []
     before: list[Pair] = []
-    for t_mm in column_t_mm(plan, theta_rad):
+    for k, t_mm in enumerate(column_t_mm(plan, theta_rad)):
         guess = homogenise.predicted(*before) if len(before) == 2 else None
-        found = homogenise.solve_pair(float(t_mm), theta_rad, plan.sheet, plan.density, guess)
-        if isinstance(found, Failure):
-            cells.append(Cell(float(t_mm), theta_rad, found.verdict, found.reason, found.residual_ratio))
-            before = []
-        else:
-            cells.append(homogenise.numbers(float(t_mm), theta_rad, found[0], found[1]))
-            before = [*before[-1:], found[1]]
+        cell, pair = _solve_one(plan, float(t_mm), theta_rad, guess, k % CURVE_EVERY == 0)
+        cells.append(cell)
+        before = [] if pair is None else [*before[-1:], pair]
     return cells
+
+
+def _solve_one(
+    plan: Plan, t_mm: float, theta_rad: float, guess: Pair | None, with_curve: bool
+) -> tuple[Cell, Pair | None]:
+    if plan.kind == "open":
+        return open_cells.solve_open_cell(t_mm, theta_rad, plan.sheet, plan.density, guess)
+    found = homogenise.solve_pair(t_mm, theta_rad, plan.sheet, plan.density, guess)
+    if isinstance(found, Failure):
+        return Cell(t_mm, theta_rad, found.verdict, found.reason, found.residual_ratio), None
+    cell = homogenise.numbers(t_mm, theta_rad, *found)
+    if with_curve and cell.verdict == "bistable":
+        cell = replace(cell, curve_mm2=homogenise.even_curve_mm2(*found))
+    return cell, found[1]
 
 
 @dataclass(frozen=True, slots=True)

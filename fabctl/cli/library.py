@@ -47,6 +47,9 @@ def command() -> None:
     "--theta", "theta_count", type=click.IntRange(5), default=43, show_default=True, help="Angles, -30° to 30°."
 )
 @click.option("--t-step-mm", type=float, default=0.01, show_default=True, help="Step of t.")
+@click.option(
+    "--open", "is_open", is_flag=True, help="The contracting kind: cut as holes, closing to its second state."
+)
 @jobs_option
 @click.option("--cluster", metavar="URL", help="A dask scheduler, tcp://HOST:PORT, whose workers have fabctl.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("library.npz"), show_default=True)
@@ -55,6 +58,7 @@ def build(
     material: str,
     theta_count: int,
     t_step_mm: float,
+    is_open: bool,
     jobs: int,
     cluster: str | None,
     output: Path,
@@ -65,7 +69,7 @@ def build(
     from design.cells.sweep import plan_of, sweep
 
     sheet = _sheet(material)
-    plan = plan_of(sheet, theta_count, t_step_mm)
+    plan = plan_of(sheet, theta_count, t_step_mm, kind="open" if is_open else "slit")
     parts = lab().root / "library-cache"
     report = _progress()
     try:
@@ -74,7 +78,7 @@ def build(
         say(f"stopped; finished columns are kept in {parts / plan.key()[:16]}, the same command goes on from there")
         raise
     words = f"fabctl library build --material {material} --theta {theta_count} --t-step-mm {t_step_mm:g}"
-    save_library(output, plan, sheet, cells, words)
+    save_library(output, plan, sheet, cells, words + (" --open" if is_open else ""))
     library = load_library(output)
     show({"file": str(output), **_summary(library)}, as_json, [f"{output}", *_lines(library)])
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from design.cells.geometry import strip_mm
+from design.cells.homogenise import even_curve_mm2, solve_pair
 from design.cells.library import CellLibrary, LibraryError, load_library
+from design.cells.mesh import REFERENCE
 from design.cells.sheet import Sheet
 
 
@@ -60,6 +62,27 @@ def test_the_range_is_the_published_one(library: CellLibrary) -> None:
 def test_outside_the_map_there_is_no_number(library: CellLibrary) -> None:
     cells = library.at(np.array([5.0, 0.5, 1.0]), np.array([0.0, 0.5, 1.0]))
     assert not cells.inside.any() and np.isnan(cells.expansion_ratio).all()
+
+
+@pytest.mark.parametrize(("t_mm", "theta_deg"), [(1.0, 0.0), (1.23, 4.9), (2.1, -7.7), (0.7, 15.1)])
+def test_the_energy_curve_has_the_maps_wells_and_barrier(library: CellLibrary, t_mm: float, theta_deg: float) -> None:
+    curve = library.energy_curve(t_mm, np.radians(theta_deg))
+    here = library.at(t_mm, np.radians(theta_deg))
+    at_P5 = int(np.argmin(np.abs(curve.stretch_ratio - here.expansion_ratio)))
+    assert curve.energy_mJ[0] == pytest.approx(0, abs=1e-9)
+    barrier = curve.energy_mJ[:at_P5].max() - curve.energy_mJ[at_P5]
+    assert barrier == pytest.approx(float(here.barrier_mJ), rel=0.02)  # sampled: the saddle lies between two points
+    assert curve.energy_mJ[at_P5] == curve.energy_mJ[at_P5 - 2 : at_P5 + 3].min()
+
+
+def test_a_kept_energy_curve_is_what_the_solver_finds(library: CellLibrary) -> None:
+    row = int(library.table["curve_row"][200])
+    t_mm, theta = library.table["t_mm"][row], library.table["theta_rad"][row]
+    found = solve_pair(t_mm, theta, library.sheet, REFERENCE)
+    assert isinstance(found, tuple)
+    scale = library.sheet.E_MPa * library.sheet.thickness_mm
+    fresh = scale * np.array(even_curve_mm2(*found))
+    np.testing.assert_allclose(library.energy_curve(t_mm, theta).energy_mJ, fresh, atol=1e-6 * fresh.max())
 
 
 def test_a_stiffer_thicker_sheet_scales_energies_only(library: CellLibrary) -> None:

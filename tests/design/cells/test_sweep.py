@@ -82,7 +82,8 @@ def test_the_key_follows_the_shape_and_not_the_rubber() -> None:
 @pytest.mark.slow
 def test_a_sweep_killed_at_any_moment_loses_only_the_column_in_hand(plan: Plan, alone: bytes, tmp_path: Path) -> None:
     code = (
-        "from pathlib import Path\nfrom design.cells.sheet import Sheet\nfrom design.cells.sweep import plan_of, sweep\n"
+        "from pathlib import Path\nfrom design.cells.sheet import Sheet\n"
+        "from design.cells.sweep import plan_of, sweep\n"
         f"sweep(plan_of(Sheet(), 5, 0.35), Path({str(tmp_path / 'parts')!r}))"
     )
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
@@ -130,9 +131,7 @@ def cluster(tmp_path: Path) -> Iterator[str]:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_two_processes_of_a_cluster_make_the_same_bytes(
-    plan: Plan, alone: bytes, cluster: str, tmp_path: Path
-) -> None:
+def test_two_processes_of_a_cluster_make_the_same_bytes(plan: Plan, alone: bytes, cluster: str, tmp_path: Path) -> None:
     cells = sweep(plan, tmp_path / "parts", cluster=cluster)
     assert library_bytes(plan, cells, tmp_path / "library.npz") == alone
 
