@@ -22,8 +22,6 @@ MODELS = {
     "method": "fabctl.config.method:MethodConfig",
     "rig": "fabctl.config.rig:RigMapConfig",
     "spec": "fabctl.config.spec:SpecConfig",
-    "method": "fabctl.config.method:MethodConfig",
-    "rig": "fabctl.config.rig:RigMapConfig",
 }
 
 
