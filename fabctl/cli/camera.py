@@ -130,7 +130,7 @@ def show_picture(bench_name: str, output: Path, as_json: bool) -> None:
     from fabctl.vision.overlay import write_picture
     from fabctl.vision.quality import picture_findings
 
-    frame = _picture(bench_name, None)
+    frame = bed_picture(bench_name, None)
     write_picture(str(output), frame.image)
     found = picture_findings(frame.image, frame.source)
     h, w = frame.image.shape
@@ -157,7 +157,7 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
         raise UsageError(f"{board_name} is a sheet of marks; the lens needs a ChArUco board")
     if config.measured_mm is None:
         say(f"{board_name}: not measured after printing; the lens does not mind, distances would")
-    bench, state = _bench(bench_name)
+    bench, state = bench_and_state(bench_name)
     frames = [read_picture(path) for path in pictures] or _live(bench, state, views)
     seen = [lens.find_board(frame.image, config.charuco(), frame.source) for frame in frames]
     for _, found in seen:
@@ -207,9 +207,9 @@ def align(
     from fabctl.vision.overlay import error_map, write_picture
 
     sheet = with_offset(load_board(marks_name, lab().root).mark_sheet(), *offset_mm)
-    bench, state = _bench(bench_name)
+    bench, state = bench_and_state(bench_name)
     glass = read_lens(lens_path(state, bench.camera.calibration if bench.camera else None))
-    frame = _picture(bench_name, image)
+    frame = bed_picture(bench_name, image)
     made = aligning.align(frame.image, frame.source, sheet, glass, datetime.now(UTC).isoformat(), height_mm)
     path = alignment_path(state)
     aligning.write_alignment(made, path)
@@ -236,8 +236,8 @@ def check(image: Path | None, bench_name: str, as_json: bool) -> None:
     from fabctl.vision.align import witness_drift_mm
     from fabctl.vision.bed import checked_alignment
 
-    _, state = _bench(bench_name)
-    frame = _picture(bench_name, image)
+    _, state = bench_and_state(bench_name)
+    frame = bed_picture(bench_name, image)
     alignment, found = checked_alignment(state, frame)
     drift = witness_drift_mm(frame.image, alignment)
     data = {"drift_mm": drift, "made_utc": alignment.made_utc, "findings": [f.as_dict() for f in found]}
@@ -269,9 +269,9 @@ def register(
     from fabctl.vision.overlay import write_picture
 
     sheet = load_board(sheet_name, lab().root).mark_sheet()
-    _, state = _bench(bench_name)
+    _, state = bench_and_state(bench_name)
     job = read_paths(design / "paths.json") if design else ()
-    found = find_sheet(state, _picture(bench_name, image), sheet, thickness_mm, job)
+    found = find_sheet(state, bed_picture(bench_name, image), sheet, thickness_mm, job)
     made = found.registration
     overlay = output.with_suffix(".png")
     write_picture(str(overlay), found.overlay)
@@ -296,17 +296,19 @@ def read_paths(path: Path) -> tuple[CutPath, ...]:
         raise BundleError(f"{path}: not JSON: {fault}") from fault
 
 
-def _bench(name: str) -> tuple[BenchConfig, Path]:
+def bench_and_state(name: str) -> tuple[BenchConfig, Path]:
+    """Return the bench file and the bench's state folder."""
     from fabctl.config.bench import load_bench
 
     config = load_bench(name, lab().root)
     return config, lab().bench_state(config.name)
 
 
-def _picture(bench_name: str, image: Path | None) -> Frame:
+def bed_picture(bench_name: str, image: Path | None) -> Frame:
+    """Return the picture in the file, or a fresh one from the bench's camera."""
     from drivers.camera import read_picture, snapshot
 
-    return read_picture(image) if image is not None else snapshot(_camera_url(*_bench(bench_name)))
+    return read_picture(image) if image is not None else snapshot(_camera_url(*bench_and_state(bench_name)))
 
 
 def _camera_url(bench: BenchConfig, state: Path) -> str:

@@ -8,11 +8,15 @@ from typing import Any
 import click
 
 from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.cut_inspect import inspect_command
 
 
 @click.group("cut", no_args_is_help=True)
 def command() -> None:
     """Cut a design on the laser."""
+
+
+command.add_command(inspect_command)
 
 
 @command.command("run")

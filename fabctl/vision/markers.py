@@ -33,6 +33,7 @@ FAMILIES: dict[Family, str] = {"5x5_250": "DICT_5X5_250", "mip_36h12": "DICT_ARU
 ACCEPT_RATIO = 0.80  # correlation of the whole picture, frame and margin included
 MARGIN_RATIO = 0.06  # by how much the best code must beat the second
 CODE_RATIO = 0.55  # correlation of the code's modules alone, where frame and margin no longer help
+HOPELESS_RATIO = 0.6  # no change of blur brings a first fit below this to ACCEPT_RATIO
 SCREEN_RATIO = 0.45  # correlation with the bare frame that a quadrilateral needs to be looked at further
 BLURS_px = (0.5, 0.9, 1.4, 2.0, 3.0)
 COARSE_PER_MODULE = 3
@@ -90,10 +91,17 @@ def find_markers(
     grey = np.ascontiguousarray(image, dtype=np.float64)
     found: dict[int, Marker] = {}
     for quad in _quadrilaterals(image, family, upscale, inverted, smallest_px):
+        if any(_same_place(quad, marker) for marker in found.values()):
+            continue  # OpenCV proposes the same outline once for each of its thresholds
         marker = read_quadrilateral(grey, quad, family, inverted)
         if marker and (marker.id not in found or found[marker.id].score_ratio < marker.score_ratio):
             found[marker.id] = marker
     return [found[k] for k in sorted(found)]
+
+
+def _same_place(quad: F64, marker: Marker) -> bool:
+    side = float(np.linalg.norm(marker.corners_px[1] - marker.corners_px[0]))
+    return bool(np.abs(quad.mean(axis=0) - marker.centre_px).max() < 0.15 * side)
 
 
 def mirrored(image: NDArray[np.uint8], family: Family = "5x5_250") -> list[Marker]:
@@ -141,7 +149,7 @@ def _refined(grey: F64, H: F64, family: Family, k: int, blur_px: float, inverted
 
 def _best_blur(grey: F64, bits: F64, H: F64, blur_px: float) -> Fit | None:
     best = fit(grey, bits, H, blur_px)
-    if best is None:
+    if best is None or abs(best.score_ratio) < HOPELESS_RATIO:
         return None
     for direction in (0.7, 1.4):
         trial = blur_px

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from design.pattern.paths import CutPath
 from fabctl.vision.align import Alignment
+from fabctl.vision.inspect import Inspection
+from fabctl.vision.profile import ToPixels
 from fabctl.vision.register import apply
 from fabctl.vision.template import F64
 
@@ -54,6 +56,31 @@ def job_on_bed(
     for path in paths:
         points = apply(affine, dense(path.points_mm, path.closed))
         polyline(picture, alignment.to_pixels(points, height_mm), COLOURS[path.layer])
+    return picture
+
+
+STATES: dict[str, Colour] = {
+    "cut": (80, 170, 60),
+    "missing": (30, 30, 230),
+    "not_through": (0, 140, 255),
+    "displaced": (220, 60, 220),
+    "unseen": (150, 150, 150),
+}
+
+
+def inspection_on_bed(image: Picture, paths: Sequence[CutPath], found: Inspection, to_pixels: ToPixels) -> Picture:
+    """Return the bed picture in colour, each path in the colour of its state, faulty ones wide."""
+    import cv2
+
+    picture: Picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    for seen in found.paths:
+        path = paths[seen.index]
+        points = to_pixels(dense(path.points_mm, path.closed))
+        polyline(picture, points, STATES[seen.state], width_px=1 if seen.state in ("cut", "unseen") else 3)
+    for k, (state, colour) in enumerate(STATES.items()):
+        count = sum(seen.state == state for seen in found.paths)
+        text = f"{state.replace('_', ' ')}: {count}"
+        cv2.putText(picture, text, (20, 40 + 34 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, 2, cv2.LINE_AA)
     return picture
 
 

@@ -103,7 +103,7 @@ def fit(image: F64, bits: F64, H: F64, blur_px: float, steps: int = 12) -> Fit |
     px = module_px(H, modules)
     if not min(px) > 0.5:
         return None
-    per_module = int(np.clip(math.ceil(max(px)), 3, 8))
+    per_module = int(np.clip(math.ceil(max(px)), 3, 6))
     places = sample_grid(modules, per_module)
     grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
     sigma_px = math.hypot(blur_px, PIXEL_SIGMA_PX)
@@ -117,10 +117,10 @@ def fit(image: F64, bits: F64, H: F64, blur_px: float, steps: int = 12) -> Fit |
         at = warp(H, grid) - origin
         grey = look(patch, at)
         J = np.column_stack([_steering(H, grid, look(slope_x, at), look(slope_y, at)), -fixed])
-        plain = grey - fixed @ np.linalg.lstsq(fixed, grey, rcond=None)[0]
+        plain = grey - fixed @ _solve(fixed, grey)
         spread = max(1.4826 * float(np.median(np.abs(plain))), 1e-6)
         weight = np.sqrt(np.minimum(1.0, HUBER * spread / np.maximum(np.abs(plain), 1e-9)))
-        step = np.linalg.lstsq(J * weight[:, None], -grey * weight, rcond=None)[0]
+        step = _solve(J * weight[:, None], -grey * weight)
         before = warp(H, CORNERS)
         H = H + np.append(step[:8], 0.0).reshape(3, 3)
         change = float(np.abs(warp(H, CORNERS) - before).max())
@@ -133,6 +133,11 @@ def fit(image: F64, bits: F64, H: F64, blur_px: float, steps: int = 12) -> Fit |
 
 
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def _solve(rows: F64, right: F64) -> F64:
+    """Return the least squares by the normal equations: a few unknowns, thousands of rows, and steps that correct."""
+    return np.asarray(np.linalg.lstsq(rows.T @ rows, rows.T @ right, rcond=None)[0], dtype=np.float64)
 
 
 def _patch(image: F64, H: F64, modules: int) -> tuple[F64, F64, F64, F64]:

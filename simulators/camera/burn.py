@@ -156,8 +156,9 @@ def _pieces(found: F64) -> F64:
 def _fallen(solid: NDArray[np.bool_], most_texels: float) -> NDArray[np.bool_]:
     """Return the pieces cut loose that are small enough to fall through the bed."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(solid.astype(np.uint8), connectivity=4)
-    small = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] < most_texels]
-    return np.isin(labels, small)
+    falls = stats[:count, cv2.CC_STAT_AREA] < most_texels
+    falls[0] = False  # what is open already
+    return np.asarray(falls[labels], dtype=bool)
 
 
 def burned(grey: F32, share: F32, sheet: Sheet, texel_mm: float) -> F32:

@@ -26,6 +26,14 @@ def main(words: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m simulators camera", description=__doc__)
     parser.add_argument("--scene", type=Path, help="JSON file of what stands before the lens; read again when changed")
     parser.add_argument("--trace", type=Path, help="the laser simulator's burn trace: t_s,x_mm,y_mm,power_frac")
+    parser.add_argument(
+        "--zero-mm",
+        type=float,
+        nargs=2,
+        default=(0.0, 0.0),
+        metavar=("X", "Y"),
+        help="where on the bed the trace is zero",
+    )
     parser.add_argument("--truth", type=Path, help="folder for the answer key")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--http", type=int, metavar="PORT", help="serve /bed.mjpg and /bed.png; 0 takes a free port")
@@ -34,7 +42,7 @@ def main(words: list[str]) -> int:
     parser.add_argument("--count", type=int, default=None, help="how many frames; a stream is unplugged after them")
     given = parser.parse_args(words)
     try:
-        source = Source(given.scene, given.trace, default_scene(given.seed), given.count)
+        source = Source(given.scene, given.trace, default_scene(given.seed), given.count, tuple(given.zero_mm))
         truth = source.studio().truth()
     except (OSError, ValueError) as fault:
         print(f"camera: {fault}", file=sys.stderr)

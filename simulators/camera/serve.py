@@ -26,8 +26,16 @@ Frame = NDArray[np.uint8]
 class Source:
     """Gives the next frame; renders anew when the scene or the burn trace has changed on disk."""
 
-    def __init__(self, scene: Path | None, trace: Path | None, default: Scene, count: int | None = None) -> None:
+    def __init__(
+        self,
+        scene: Path | None,
+        trace: Path | None,
+        default: Scene,
+        count: int | None = None,
+        zero_mm: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         self._scene, self._trace, self._default, self._left = scene, trace, default, count
+        self._zero = np.array([0.0, *zero_mm, 0.0])
         self._stamp: tuple[object, ...] = ()
         self._studio: Studio | None = None
         self._rows: F64 = NOTHING_BURNED
@@ -51,7 +59,8 @@ class Source:
             if self._studio is None or stamp[0] != self._stamp[0]:
                 present = self._scene is not None and self._scene.is_file()
                 self._studio = Studio(read_scene(self._scene) if present and self._scene else self._default)
-            self._rows = read_trace(self._trace) if self._trace and self._trace.is_file() else NOTHING_BURNED
+            present = self._trace is not None and self._trace.is_file()
+            self._rows = read_trace(self._trace) + self._zero if present and self._trace else NOTHING_BURNED
             self._stamp = stamp
         return self._studio
 
