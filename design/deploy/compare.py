@@ -10,6 +10,7 @@ from design.deploy.shell import Ints, Reals
 from design.surface import TriMesh
 
 REFINEMENTS = 30  # rounds of closest points; stops earlier once the pose stands still
+FREE_RATIO = 0.03  # a motion that changes distances by less than this of the strongest one is left alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ def _moved(x: Reals, points: Reals, nearest: Reals, normal: Reals, area: Reals) 
     size = float(np.ptp(points, axis=0).max())
     system = np.hstack([lever / size, normal]) * weight
     # A sphere turns in itself: directions that change nothing get no motion.
-    answer = np.linalg.lstsq(system, gap * weight[:, 0], rcond=1e-3)[0]
+    answer = np.linalg.lstsq(system, gap * weight[:, 0], rcond=FREE_RATIO)[0]
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_rotvec(answer[:3] / size).as_matrix()

@@ -43,11 +43,11 @@ def designed_layout(
     return joined, came_from
 
 
-def lift(points_mm: Reals, flat_mm: Reals, faces: Ints, space_mm: Reals) -> Reals:
+def lift(points_mm: Reals, flat_mm: Reals, faces: Ints, space_mm: Reals, space_faces: Ints | None = None) -> Reals:
     """Return where points of the flat `(k, 2)` lie on the surface that was flattened, `(k, 3)`.
 
-    `flat_mm` `(n, 2)` and `space_mm` `(n, 3)` are the same mesh's vertices in the flat and in space. Points beside the
-    flat continue its nearest face.
+    `flat_mm` `(n, 2)` and `space_mm` are the same mesh's vertices in the flat and in space; where cuts gave the flat
+    more vertices, `space_faces` are the same faces in space. Points beside the flat continue its nearest face.
     """
     import igl
 
@@ -55,7 +55,13 @@ def lift(points_mm: Reals, flat_mm: Reals, faces: Ints, space_mm: Reals) -> Real
     wanted = np.column_stack([points_mm, np.zeros(len(points_mm))])
     face = np.asarray(igl.point_mesh_squared_distance(wanted, level, np.ascontiguousarray(faces))[1])
     a, b, c = (flat_mm[faces[face, k]] for k in range(3))
-    return np.asarray(np.einsum("nk,nkd->nd", _barycentric(points_mm, a, b, c), space_mm[faces[face]]))
+    return np.asarray(
+        np.einsum(
+            "nk,nkd->nd",
+            _barycentric(points_mm, a, b, c),
+            space_mm[(faces if space_faces is None else space_faces)[face]],
+        )
+    )
 
 
 def _barycentric(p: Reals, a: Reals, b: Reals, c: Reals) -> Reals:

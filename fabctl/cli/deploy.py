@@ -1,0 +1,158 @@
+"""`fabctl deploy`: predict the deployed shape of a design, its sag on a support and its other shapes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fabctl.cli.common import json_option, lab, progress, show
+
+if TYPE_CHECKING:
+    from design.deploy.predict import Deployed
+    from design.deploy.supports import Settled, Support
+    from fabctl.deploying import Laid
+    from fabctl.events import Emit
+
+
+@click.command()
+@click.argument("design", type=click.Path(path_type=Path))
+@click.option("--gravity", is_flag=True, help="Let the sheet's own weight act (along −z).")
+@click.option(
+    "--support",
+    type=click.Choice(["held", "no-slip", "coulomb", "slip"]),
+    default="no-slip",
+    show_default=True,
+    help="What the rim stands on, with --gravity.",
+)
+@click.option("--friction", type=click.FloatRange(0), default=0.5, show_default=True, help="Coefficient for coulomb.")
+@click.option("--level-floor", is_flag=True, help="A level floor instead of a bed made to the rim.")
+@click.option("--shapes", type=click.IntRange(0), default=0, help="Look for other equilibria from this many starts.")
+@click.option("--animation/--no-animation", default=True, help="Write the deployment as an animated picture.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder to write into [DESIGN-deployed].")
+@json_option
+def command(
+    design: Path,
+    gravity: bool,
+    support: Support,
+    friction: float,
+    level_floor: bool,
+    shapes: int,
+    animation: bool,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Predict what the sheet of the design folder DESIGN pops up to."""
+    from design.deploy.predict import deploy
+    from design.deploy.supports import settle
+    from fabctl.deploying import read_laid
+    from fabctl.events import Event
+
+    emit = progress()
+    laid = read_laid(design, lab().root)
+    emit(Event("stage", f"deploying {len(laid.layout.cells)} units"))
+    popped = deploy(laid.layout, laid.target, laid.start_mm if laid.design_mm is None else laid.design_mm)
+    settled = None
+    if gravity:
+        emit(Event("stage", f"its weight acts; rim: {support}"))
+        settled = settle(laid.layout, popped.mesh.vertices_mm, laid.sheet, support, friction, not level_floor)
+    folder = output or design.with_name(design.name + "-deployed")
+    facts = {**_facts(popped), **_sag(settled, support)}
+    if shapes:
+        facts["shapes"] = _shapes(laid, shapes, emit)
+    facts["folder"] = str(folder)
+    _write(folder, laid, popped, settled, animation, facts)
+    show(facts, as_json, _lines(facts))
+
+
+def _facts(popped: Deployed) -> dict[str, Any]:
+    rest, off = popped.equilibrium, popped.deviation
+    return {
+        "units_count": len(popped.mesh.faces),
+        "deviation_mean_mm": off.mean_mm,
+        "deviation_rms_mm": off.rms_mm,
+        "deviation_max_mm": off.max_mm,
+        "deviation_mean_frac": off.mean_frac,
+        "points_rms_mm": off.points_rms_mm,
+        "energy_mJ": rest.energy_mJ,
+        "stable": rest.stable,
+        "residual_ratio": rest.residual_ratio,
+        "iterations_count": rest.iterations_count,
+    }
+
+
+def _sag(settled: Settled | None, support: str) -> dict[str, Any]:
+    if settled is None:
+        return {}
+    return {
+        "support": support,
+        "weight_N": settled.weight_N,
+        "sag_mm": settled.sag_mm,
+        "slid_mm": settled.slid_mm,
+        "standing_count": settled.standing_count,
+        "loaded_residual_ratio": settled.equilibrium.residual_ratio,
+        "loaded_stable": settled.equilibrium.stable,
+    }
+
+
+def _shapes(laid: Laid, count: int, emit: Emit) -> list[dict[str, Any]]:
+    from design.deploy.predict import compared
+    from design.deploy.search import equilibria
+    from fabctl.events import Event
+
+    def watch(done_frac: float, name: str) -> None:
+        emit(Event("progress", f"looking for other shapes: {name}", done_frac))
+
+    found, lost = equilibria(laid.layout, laid.design_mm, count, watch=watch)
+    rows: list[dict[str, Any]] = []
+    for one in found:
+        off = compared(laid.layout, one.equilibrium, laid.target, laid.design_mm).deviation
+        rest = one.equilibrium
+        rows.append(
+            {"energy_mJ": rest.energy_mJ, "deviation_mean_mm": off.mean_mm, "deviation_mean_frac": off.mean_frac,
+             "stable": rest.stable, "residual_ratio": rest.residual_ratio, "starts": list(one.starts)}
+        )  # fmt: skip
+    for line in lost:
+        emit(Event("warning", f"no shape from {line}"))
+    return rows
+
+
+def _write(
+    folder: Path, laid: Laid, popped: Deployed, settled: Settled | None, animation: bool, facts: dict[str, Any]
+) -> None:
+    from design.deploy.path import deployment
+    from design.meshfiles import write_ply
+    from design.surface import TriMesh
+    from fabctl.deploying import animation_gif, picture_png
+    from fabctl.records.folder import as_json, write_atomically
+
+    folder.mkdir(parents=True, exist_ok=True)
+    shown = popped.mesh if settled is None else TriMesh(settled.equilibrium.x_mm, popped.mesh.faces)
+    write_ply(folder / "deployed.ply", shown)
+    title = "deployed" if settled is None else f"deployed, under its weight ({facts['support']})"
+    (folder / "deployed.png").write_bytes(picture_png(shown, laid.target, title))
+    if animation:
+        frames = deployment(laid.layout, popped.mesh.vertices_mm)
+        (folder / "deployment.gif").write_bytes(animation_gif(frames, popped.mesh, "deployment"))
+    write_atomically(folder / "deploy.json", as_json(facts))
+
+
+def _lines(facts: dict[str, Any]) -> list[str]:
+    lines = [
+        f"{facts['units_count']} units: {facts['deviation_mean_mm']:.2f} mm from the target on average "
+        f"({facts['deviation_mean_frac']:.2%} of its diagonal), {facts['deviation_max_mm']:.2f} mm at most",
+        f"{'stable' if facts['stable'] else 'not stable'}; residual {facts['residual_ratio']:.1e} "
+        f"after {facts['iterations_count']} iterations",
+    ]
+    if "sag_mm" in facts:
+        lines.append(
+            f"weight {facts['weight_N']:.3f} N, rim {facts['support']}: sags {facts['sag_mm']:.2f} mm at the top, "
+            f"slides {facts['slid_mm']:.2f} mm"
+        )
+    for shape in facts.get("shapes", []):
+        lines.append(
+            f"shape of {shape['energy_mJ']:.4f} mJ: {shape['deviation_mean_mm']:.2f} mm from the target "
+            f"({', '.join(shape['starts'])})"
+        )
+    return [*lines, f"written to {facts['folder']}"]

@@ -1,0 +1,145 @@
+"""From a design folder back to the shell that it describes, and what `fabctl deploy` writes about it."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.bundle import open_bundle
+from design.cells.bending_map import load_bending
+from design.cells.library import load_library
+from design.cells.sheet import Sheet
+from design.deploy.designed import lift
+from design.deploy.levels import Layout, sheet_layout
+from design.deploy.shell import Reals
+from design.findings import Finding
+from design.meshfiles import read_mesh
+from design.surface import TriMesh
+from fabctl.config.material import load_material
+from fabctl.config.spec import load_spec
+from fabctl.designing import sheet_of
+from fabctl.errors import RefusedError
+
+NUMBERS = ("cx_mm", "cy_mm", "inverted", "t_mm", "theta_deg", "expansion_ratio")
+ROUNDING_MM = 1e-3  # cells.csv and the meshes are rounded to less than this
+
+
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """A design as a shell, with where it should go."""
+
+    layout: Layout
+    start_mm: Reals  # (n, 3) the shape found when the design was built
+    target: TriMesh
+    design_mm: Reals | None  # (n, 3) where each vertex belongs, where the folder tells
+    sheet: Sheet
+
+
+def read_laid(folder: Path, home: Path) -> Laid:
+    """Return the shell of a design folder; raise `BundleError`, or `RefusedError` where it was built without one."""
+    bundle = open_bundle(folder)
+    if "deployed.ply" not in bundle.manifest["files"]:
+        missing = Finding("DEPLOY-NONE", "was built without a prediction", where=str(folder), hint="set `response`")
+        raise RefusedError("nothing to deploy", [missing])
+    rows = bundle.cells()
+    table = {name: np.array([float(row[name]) for row in rows]) for name in NUMBERS}
+    centre = np.column_stack([table["cx_mm"], table["cy_mm"]])
+    inverted = table["inverted"] == 1
+    t, theta, expansion = table["t_mm"], np.deg2rad(table["theta_deg"]), table["expansion_ratio"]
+    shape, _ = read_mesh(bundle.file("deployed.ply"))
+    edge_mm = _edge_mm(centre)
+    flat = _flat_vertices(centre, inverted, edge_mm, shape)
+    config, _ = load_spec(str(bundle.file("spec.yaml")), home)
+    sheet = sheet_of(load_material(config.material, home), edge_mm)
+    library = load_library(Path(config.library) if config.library else None).scaled(sheet)
+    cells = library.at(t, theta)
+    mean = float(np.nanmean(cells.nu_tangent_ratio))
+    nu = np.where(np.isfinite(cells.nu_tangent_ratio), cells.nu_tangent_ratio, mean)
+    Y = np.where(np.isfinite(cells.Y_N_mm), cells.Y_N_mm, np.nanmean(cells.Y_N_mm))
+    D = np.asarray(load_bending().D_mJ(expansion, theta, sheet))
+    target, _ = read_mesh(bundle.file("target.ply"))
+    paper, _ = read_mesh(bundle.file("flat.ply"))
+    goal = None
+    if len(paper.faces) == len(target.faces):
+        goal = lift(flat, paper.vertices_mm[:, :2], paper.faces, target.vertices_mm, target.faces)
+    return Laid(sheet_layout(flat, shape.faces, expansion, Y, nu, D), shape.vertices_mm, target, goal, sheet)
+
+
+def _edge_mm(centre_mm: Reals) -> float:
+    from scipy.spatial import cKDTree
+
+    nearest = np.asarray(cKDTree(centre_mm).query(centre_mm, k=2)[0])
+    return float(np.median(nearest[:, 1]) * np.sqrt(3))
+
+
+def _flat_vertices(centre: Reals, inverted: NDArray[np.bool_], edge_mm: float, shape: TriMesh) -> Reals:
+    """Return the flat position of the deployed mesh's vertices; its faces are the cells, in their order."""
+    low, high = edge_mm / np.sqrt(12), edge_mm / np.sqrt(3)
+    upright = np.array([[-edge_mm / 2, -low], [edge_mm / 2, -low], [0, high]])
+    hanging = np.array([[0, -high], [edge_mm / 2, low], [-edge_mm / 2, low]])
+    corners = centre[:, None] + np.where(inverted[:, None, None], hanging, upright)
+    if len(shape.faces) != len(corners):
+        raise RefusedError("the deployed mesh is not that of the cells", [])
+    flat = np.full((len(shape.vertices_mm), 2), np.nan)
+    flat[shape.faces.ravel()] = corners.reshape(-1, 2)
+    if np.abs(flat[shape.faces] - corners).max() > ROUNDING_MM:
+        fault = Finding("DEPLOY-SEAM", "the design has a re-joined seam", hint="use the prediction of the build")
+        raise RefusedError("the deployed mesh does not lie flat as the cells do", [fault])
+    return flat
+
+
+def picture_png(mesh: TriMesh, target: TriMesh, title: str) -> bytes:
+    """Return a picture of a deployed sheet, coloured by its distance from the target."""
+    from design.deploy.compare import closest
+
+    distance = closest(mesh.vertices_mm[mesh.faces].mean(axis=1), target)[0]
+    figure, axes, faces = _stage(mesh, title)
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+
+    scale = ScalarMappable(cmap=colormaps["viridis"])
+    scale.set_array(distance)
+    faces.set_facecolor(scale.to_rgba(distance))
+    figure.colorbar(scale, ax=axes, shrink=0.6, label="distance from the target, mm")
+    out = io.BytesIO()
+    figure.savefig(out, dpi=110, format="png")
+    return out.getvalue()
+
+
+def animation_gif(frames_mm: list[Reals], mesh: TriMesh, title: str) -> bytes:
+    """Return the deployment as an animated picture, flat first, with the last frame held."""
+    from PIL import Image
+
+    figure, _, faces = _stage(mesh, title)
+    pictures = []
+    for x in [*frames_mm, *[frames_mm[-1]] * 6]:
+        faces.set_verts(list(x[mesh.faces]))
+        figure.canvas.draw()
+        pictures.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3]))
+    out = io.BytesIO()
+    pictures[0].save(out, format="GIF", save_all=True, append_images=pictures[1:], duration=120, loop=0)
+    return out.getvalue()
+
+
+def _stage(mesh: TriMesh, title: str):  # type: ignore[no-untyped-def]  # matplotlib has no types here
+    """Return a figure, its axes and the mesh's faces in it."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    figure = Figure(figsize=(7, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(projection="3d")
+    faces = Poly3DCollection(list(mesh.vertices_mm[mesh.faces]), edgecolors="#333", linewidths=0.3, facecolors="#8ab")
+    axes.add_collection3d(faces)
+    low, high = mesh.vertices_mm.min(axis=0), mesh.vertices_mm.max(axis=0)
+    middle, reach = (low + high) / 2, 0.5 * float(np.ptp(mesh.vertices_mm, axis=0).max())
+    for k, name in enumerate("xyz"):
+        getattr(axes, f"set_{name}lim")(middle[k] - reach, middle[k] + reach)
+        getattr(axes, f"set_{name}label")(f"{name}, mm")
+    axes.set_title(title)
+    return figure, axes, faces

@@ -1,0 +1,57 @@
+"""`fabctl deploy` takes a design folder and tells what pops up."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from design.errors import BundleError
+from design.meshfiles import read_mesh
+from fabctl.cli.deploy import command
+from fabctl.deploying import read_laid
+from fabctl.designing import build_folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    home = tmp_path_factory.mktemp("lab")
+    build_folder("cap", home / "cap", home, cell_mm=20.0)
+    return home / "cap"
+
+
+def test_a_design_folder_gives_back_the_shell_it_was_built_with(folder: Path) -> None:
+    laid = read_laid(folder, folder.parent)
+    assert laid.layout.edge_mm == pytest.approx(20.0, abs=1e-4)
+    assert laid.design_mm is not None
+    assert np.linalg.norm(laid.start_mm - laid.design_mm, axis=1).mean() < 4.0
+    assert laid.layout.Y_N_mm.min() > 0
+
+
+def test_deploying_a_design_writes_shape_pictures_and_numbers(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "popped"
+    words = [str(folder), "--gravity", "--support", "held", "--json", "-o", str(out)]
+    ran = CliRunner().invoke(command, words, obj=str(folder.parent), catch_exceptions=False)
+    assert ran.exit_code == 0
+    told = json.loads(ran.stdout)
+    assert told["stable"] is True
+    assert told["residual_ratio"] < 1e-8
+    assert told["loaded_residual_ratio"] < 1e-8
+    assert 0 < told["sag_mm"] < 5
+    assert {p.name for p in out.iterdir()} == {"deployed.ply", "deployed.png", "deployment.gif", "deploy.json"}
+    assert len(read_mesh(out / "deployed.ply")[0].faces) == told["units_count"]
+    assert (out / "deployment.gif").read_bytes()[:4] == b"GIF8"
+
+
+def test_a_folder_that_was_edited_is_refused(folder: Path) -> None:
+    cells = folder / "cells.csv"
+    before = cells.read_bytes()
+    try:
+        cells.write_bytes(before + b"\n")
+        with pytest.raises(BundleError):
+            read_laid(folder, folder.parent)
+    finally:
+        cells.write_bytes(before)
