@@ -95,7 +95,7 @@ def misfit_png(mesh: TriMesh, report: FeasibilityReport, title: str) -> bytes:
     figure = Figure(figsize=(14, 6), layout="constrained")
     FigureCanvasAgg(figure)
     flat = report.flattening()
-    expansion = flat.expansion_ratio / report.scale_ratio if report.best() is None else flat.expansion_ratio
+    expansion = flat.expansion_ratio / report.scale_ratio
     colours = report.colors(mesh)[mesh.faces].mean(axis=1) / 255
     space = figure.add_subplot(1, 2, 1, projection="3d")
     x, y, z = mesh.vertices_mm.T

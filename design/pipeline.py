@@ -92,6 +92,8 @@ def build(
     watch("drawing slits", 0.4)
     cells = Cells(tiling, wanted, choice, hinge, tuple("cut" for _ in wanted))
     drawing, shift = draw(spec, cells, library.sheet)
+    if drawing.id_anchor is None and spec.border.id_height_mm > 0:
+        found.append(Finding("ID-PLACE", "no lower edge has room for the tag: no id can be engraved", "warning"))
     cells = replace(cells, tiling=tiling.moved(shift))
     placed = replace(placed, flat_mm=placed.flat_mm + shift)
     watch("ordering the cut", 0.5)

@@ -12,7 +12,6 @@ import shapely
 from shapely.affinity import translate
 from shapely.geometry.base import BaseGeometry
 
-from design.errors import DesignError
 from design.pattern.drawing import Box, Drawing
 from design.pattern.font import Anchor
 from design.pattern.paths import CutPath
@@ -51,7 +50,7 @@ def framed(
     """Return the whole drawing, with its lower left corner in the origin, and by how much all was moved, `(2,)`.
 
     `loops_mm` bound the cells, `mouths_mm` `(b, 2)` are where slits open on that border; the tag's neck keeps clear of
-    them. Raises `DesignError` where no border edge has room for the tag.
+    them where it can. Where no lower edge has room for the tag, there is none.
     """
     piece = _polygon(loops_mm)
     if options.margin_mm > 0:
@@ -118,13 +117,20 @@ def registration_marks(size_mm: tuple[float, float], options: BorderOptions) -> 
 
 def _with_tag(
     piece: BaseGeometry, mouths_mm: Array, options: BorderOptions, edge_mm: float
-) -> tuple[BaseGeometry, Anchor, Box | None]:
-    """Return the piece with a tag hanging from its lowest edge that has room, and the places on the tag."""
+) -> tuple[BaseGeometry, Anchor | None, Box | None]:
+    """Return the piece with a tag hanging from its lowest edge that has room, and the places on the tag.
+
+    The piece alone where no edge has.
+    """
     code_width, code_height = (count * options.code_module_mm for count in CODE_MODULES)
     width = max(options.id_width_mm, code_width) + 2 * CLEARANCE_MM
     height = options.id_height_mm + 2 * CLEARANCE_MM + (code_height + CLEARANCE_MM if code_height > 0 else 0.0)
-    neck = min(NECK_MM, edge_mm / 3)
-    for x, y in _neck_places(piece, mouths_mm, neck, options.margin_mm > 0):
+    clear = np.zeros((0, 2)) if options.margin_mm > 0 else mouths_mm
+    narrow = min(NECK_MM, edge_mm / 3)
+    # Cells too small to pass between their mouths: the neck closes a few of them.
+    places = [(at, narrow) for at in _neck_places(piece, clear, narrow)]
+    places += [(at, NECK_MM) for at in _neck_places(piece, np.zeros((0, 2)), NECK_MM)]
+    for (x, y), neck in places:
         body = shapely.box(x - width / 2, y - CLEARANCE_MM - height, x + width / 2, y - CLEARANCE_MM)
         if body.distance(piece) < CLEARANCE_MM - 1e-9:
             continue
@@ -134,23 +140,19 @@ def _with_tag(
         code = Box(x - code_width / 2, base, code_width, code_height) if code_height > 0 else None
         text_y = y - 2 * CLEARANCE_MM - options.id_height_mm / 2
         return joined, Anchor(x, text_y, options.id_height_mm, width - 2 * CLEARANCE_MM), code
-    raise DesignError(
-        "no lower edge of the sheet has room for the tag that carries the id; "
-        "make it smaller (border.id_width_mm, border.code_module_mm) or leave it out (border.id_height_mm: 0)"
-    )
+    return piece, None, None
 
 
-def _neck_places(piece: BaseGeometry, mouths_mm: Array, neck_mm: float, has_margin: bool) -> list[tuple[float, float]]:
+def _neck_places(piece: BaseGeometry, mouths_mm: Array, neck_mm: float) -> list[tuple[float, float]]:
     """Return the middles of level stretches of the lower border that are free of slit mouths, lowest first."""
     found = []
     for ring in _rings(piece):
-        for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        for a, b in zip(ring.tolist(), np.roll(ring, -1, axis=0).tolist(), strict=True):
             if abs(b[1] - a[1]) > 1e-9 or b[0] <= a[0]:
                 continue  # counter-clockwise, so that the lower border runs towards +x
-            on = np.abs(mouths_mm[:, 1] - a[1]) < 1e-6 if len(mouths_mm) and not has_margin else np.zeros(0, dtype=bool)
-            mouths = mouths_mm[: len(on)][on, 0]
+            mouths = mouths_mm[np.abs(mouths_mm[:, 1] - a[1]) < 1e-6, 0]
             stops = np.sort(np.r_[a[0], mouths[(mouths > a[0]) & (mouths < b[0])], b[0]])
             for left, right in pairwise(stops.tolist()):
                 if right - left >= neck_mm + 2 * CLEARANCE_MM:
-                    found.append(((left + right) / 2, float(a[1])))
+                    found.append(((left + right) / 2, a[1]))
     return sorted(found, key=lambda place: (round(place[1], 6), abs(place[0] - piece.centroid.x)))

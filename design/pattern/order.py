@@ -19,7 +19,7 @@ from design.pattern.tiling import Array, Index
 NEAR_COUNT = 8  # neighbours looked at from every stroke end
 CHAIN_COUNT = 25  # links exchanged in one chain at most
 FIRST_COUNT = 5  # ways tried at a chain's first link
-ROUNDS_COUNT, ROUND_GAIN_RATIO = 6, 0.002  # all ends are looked at again while a round still gains this much
+ROUNDS_COUNT, ROUND_GAIN_RATIO = 5, 0.004  # all ends are looked at again while a round still gains this much
 RUN_COUNT = 3  # strokes moved together at most
 KICK_COUNT = 30  # strokes in a run that a kick moves at most
 KICKS_BUDGET_COUNT = 4_000_000  # kicks times strokes: a kick costs more on a longer tour; about a second
