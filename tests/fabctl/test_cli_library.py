@@ -1,0 +1,105 @@
+"""`fabctl library` from the outside."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from design.cells.calibrate import calibrate
+from design.cells.library import load_library
+from design.errors import DesignError
+from fabctl.cli.main import cli
+
+
+def run(*words: str, home: Path) -> Result:
+    return CliRunner().invoke(cli, ["--home", str(home), "library", *words], catch_exceptions=True)
+
+
+def test_show_tells_range_counts_and_reasons(tmp_path: Path) -> None:
+    told = json.loads(run("show", "--json", home=tmp_path).stdout)
+    assert told["cells_count"] == len(load_library())
+    assert sum(told["candidates"].values()) == 7552
+    assert told["command"].startswith("fabctl library build")
+
+
+def test_cell_gives_numbers_slits_and_a_picture(tmp_path: Path) -> None:
+    picture = tmp_path / "states.svg"
+    told = json.loads(
+        run("cell", "--t-mm", "1.2", "--theta-deg", "3", "-o", str(picture), "--json", home=tmp_path).stdout
+    )
+    there = load_library().at(1.2, math.radians(3))
+    assert told["expansion_ratio"] == pytest.approx(float(there.expansion_ratio), abs=2e-4)
+    assert told["Y_N_mm"] == pytest.approx(float(there.Y_N_mm), rel=2e-3)
+    assert np.shape(told["slits_mm"]) == (3, 4, 2)
+    assert "</svg>" in picture.read_text()
+
+
+def test_a_cell_that_is_not_bistable_says_why(tmp_path: Path) -> None:
+    told = json.loads(run("cell", "--t-mm", "3", "--theta-deg", "0", "--json", home=tmp_path).stdout)
+    assert told["verdict"] == "not bistable" and told["reason"] and told["expansion_ratio"] is None
+
+
+def test_plot_draws_the_maps(tmp_path: Path) -> None:
+    picture = tmp_path / "maps.svg"
+    assert run("plot", "-o", str(picture), home=tmp_path).exit_code == 0
+    assert picture.read_text().count('<g id="axes_') >= 4
+
+
+def test_build_makes_a_library_that_show_reads(tmp_path: Path) -> None:
+    file = tmp_path / "small.npz"
+    words = ("build", "--theta", "5", "--t-step-mm", "0.5", "--jobs", "1", "-o", str(file), "--json")
+    first = json.loads(run(*words, home=tmp_path).stdout)
+    body = file.read_bytes()
+    assert first["cells_count"] > 0
+    assert json.loads(run("show", "--library", str(file), "--json", home=tmp_path).stdout)["hash"] == first["hash"]
+    run(*words, home=tmp_path)
+    assert file.read_bytes() == body
+
+
+def test_compare_reports_against_a_table(tmp_path: Path) -> None:
+    library = load_library()
+    rows = [200, 900, 1500, 2200]
+    table = tmp_path / "published.csv"
+    lines = [
+        f"{library.t_mm[k] / 10},{library.theta_rad[k]},{library.expansion_ratio[k]},{library.barrier_mJ[k]},"
+        f"{library.stiffness_mJ[k]}"
+        for k in rows
+    ]
+    table.write_text("\n".join(["t_over_l0,theta_rad,expansion_ratio,energy_barrier,stiffness", *lines]))
+    told = json.loads(run("compare", str(table), "--jobs", "1", "--json", home=tmp_path).stdout)
+    assert told["rows_count"] == 4
+    assert told["solved_all"]["expansion"]["worst"] < 1e-6
+    assert told["solved_all"]["stiffness"]["worst"] < 1e-6
+
+
+def test_a_table_without_its_columns_is_refused(tmp_path: Path) -> None:
+    table = tmp_path / "published.csv"
+    table.write_text("a,b\n1,2\n")
+    result = run("compare", str(table), home=tmp_path)
+    assert "t_over_l0" in str(result.exception)
+
+
+def test_calibrate_finds_the_modulus_of_a_stiffer_sheet(tmp_path: Path) -> None:
+    depth = np.linspace(0, 4, 81)
+    predicted = 0.3 * depth + 0.05 * depth**2
+    response, measured = tmp_path / "response.csv", tmp_path / "samples.csv"
+    rows = "\n".join(f"{d},{f},{f}" for d, f in zip(depth, predicted, strict=True))
+    response.write_text(f"# fabctl response 1; indenter_radius_mm=8\ndepth_mm,load_N,unload_N\n{rows}\n")
+    noise = 0.002 * np.random.default_rng(5).standard_normal(81)
+    rows = "\n".join(f"{d + 0.15},{f}" for d, f in zip(depth, 1.6 * predicted + noise, strict=True))
+    measured.write_text(f"depth_mm,force_N\n{rows}\n")
+    told = json.loads(run("calibrate", str(measured), str(response), "--json", home=tmp_path).stdout)
+    assert told["E_MPa"] == pytest.approx(1.6 * 1.5, rel=0.01)
+    assert told["contact_mm"] == pytest.approx(0.15, abs=0.02)
+    assert told["E_thickness_N_mm"] == pytest.approx(1.6 * 1.5 * 2.3, rel=0.01)
+
+
+def test_too_short_a_curve_calibrates_nothing() -> None:
+    depth = np.linspace(0, 1, 5)
+    with pytest.raises(DesignError, match="measure deeper"):
+        calibrate(depth, depth, np.linspace(0, 4, 50), np.linspace(0, 4, 50))
