@@ -24,8 +24,8 @@ DESIGN_FILES = {
 @pytest.mark.slow
 def test_design_cut_indent_scan_and_report_agree_with_the_answer_key(simulated_bench: SimulatedBench) -> None:
     home = simulated_bench.lab.root
-    (home / "little-cap.yaml").write_text(SPEC)
-    found = simulated_bench.fabctl("flow", "little-cap.yaml", "--bench", "sim", "--method", "quick", "--yes")
+    spec = str(Path(__file__).parents[2] / "configs/specs/cap.yaml")
+    found = simulated_bench.fabctl("flow", spec, "--bench", "sim", "--method", "quick", "--yes")
 
     assert found["specimen"] == "S-0001"
     assert {p.name for p in (home / "specimens/S-0001/design").iterdir()} >= DESIGN_FILES
