@@ -95,7 +95,7 @@ def build(
     if drawing.id_anchor is None and spec.border.id_height_mm > 0:
         found.append(Finding("ID-PLACE", "no lower edge has room for the tag: no id can be engraved", "warning"))
     cells = replace(cells, tiling=tiling.moved(shift))
-    placed = replace(placed, flat_mm=placed.flat_mm + shift)
+    placed = placed.moved_to(placed.flat_mm + shift)
     watch("ordering the cut", 0.5)
     job = compose_job(drawing, presets, JobOptions(tool=spec.tool, spread_mm=spec.spread_mm), remarks=[spec.name])
     predicted = None
@@ -164,7 +164,7 @@ def scaled(
     if spec.placement == "optimised":
         place, misfit = best_place(flat.flat_mm, flat.faces, spec.cell_mm)
         found.append(Finding("TILE-FIT", f"flat and cells differ on {misfit:.1%} of the flat's area", "info"))
-    flat = replace(flat, flat_mm=place.put(flat.flat_mm))
+    flat = flat.moved_to(place.put(flat.flat_mm))
     fits: list[tuple[float, Flattening, Tiling, Array]] = []
     for done_count in range(SCALE_ROUNDS_COUNT):
         tiling = tile(flat.flat_mm, flat.faces, spec.cell_mm, place.shift_mm)

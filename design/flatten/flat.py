@@ -123,7 +123,7 @@ def _flatten_tube(mesh: TriMesh, loops: list[Indices], options: FlattenOptions) 
     seam = Seam(number[strip.left], number[strip.right], 0.0, (strip.period_mm, 0.0), 0.0, closes_tube=True)
     opened = TriMesh(mesh.vertices_mm[index], faces)
     found = check_flat(opened, flat_mm, faces, boundary_loops(opened))
-    return _finish(mesh, flat_mm, faces, index, strip.u[keep], (_measured(seam, flat_mm),), found)
+    return _finish(mesh, flat_mm, faces, index, strip.u[keep], (seam.measured(flat_mm),), found)
 
 
 def _flatten_with_cones(mesh: TriMesh, loops: list[Indices], options: FlattenOptions) -> Flattening:
@@ -144,7 +144,7 @@ def _flatten_cut(mesh: TriMesh, opened: Cut, options: FlattenOptions) -> Flatten
     given = None if options.boundary_u is None else options.boundary_u[index]
     u = surface.scale_factors(rim_u(surface, replace(options, boundary_u=given)))
     flat_mm = lay_out(surface, u, _twins(surface.rim, opened))[: surface.count]
-    seams = tuple(_measured(Seam(left, right, 0.0, (0.0, 0.0), 0.0), flat_mm) for right, left in opened.sides)
+    seams = tuple(Seam(left, right, 0.0, (0.0, 0.0), 0.0).measured(flat_mm) for right, left in opened.sides)
     found = check_flat(opened.mesh, flat_mm, opened.mesh.faces, loops)
     return _finish(mesh, flat_mm, opened.mesh.faces, index, u[: surface.count], seams, found)
 
@@ -159,20 +159,6 @@ def _twins(rim: Indices, opened: Cut) -> Indices:
         one, other = place[left[:-1]], place[right[1:]]
         twins[one], twins[other] = other, one
     return twins
-
-
-def _measured(seam: Seam, flat_mm: Points) -> Seam:
-    """Return the seam with the motion that carries its left side onto its right one, and the gap that is left."""
-    a, b = flat_mm[seam.left] @ [1, 1j], flat_mm[seam.right] @ [1, 1j]
-    turn = 1.0 + 0j
-    if not seam.closes_tube:
-        inner = np.vdot(a - a.mean(), b - b.mean())
-        turn = inner / abs(inner)
-    shift = b.mean() - turn * a.mean() if not seam.closes_tube else complex(*seam.translation_mm)
-    gap_mm = float(np.abs(turn * a + shift - b).max())
-    return replace(
-        seam, rotation_rad=float(np.angle(turn)), translation_mm=(float(shift.real), float(shift.imag)), gap_mm=gap_mm
-    )
 
 
 def _finish(

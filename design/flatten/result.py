@@ -62,6 +62,25 @@ class Seam:
     gap_mm: float
     closes_tube: bool = False
 
+    def measured(self, flat_mm: Points) -> Seam:
+        """Return the seam with the motion that carries its left side onto its right one in `flat_mm`, and the gap left.
+
+        A tube's seam is carried by a translation alone, whatever is measured.
+        """
+        a, b = flat_mm[self.left] @ [1, 1j], flat_mm[self.right] @ [1, 1j]
+        turn = 1.0 + 0j
+        if not self.closes_tube:
+            inner = np.vdot(a - a.mean(), b - b.mean())
+            turn = inner / abs(inner)
+        shift = b.mean() - turn * a.mean()
+        gap_mm = float(np.abs(turn * a + shift - b).max())
+        return replace(
+            self,
+            rotation_rad=float(np.angle(turn)),
+            translation_mm=(float(shift.real), float(shift.imag)),
+            gap_mm=gap_mm,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Flattening:
@@ -83,6 +102,10 @@ class Flattening:
     def diagonal_mm(self) -> float:
         """Return the diagonal of the flat's bounding box."""
         return float(np.linalg.norm(np.ptp(self.flat_mm, axis=0)))
+
+    def moved_to(self, flat_mm: Points) -> Flattening:
+        """Return the same with the flat turned and shifted to `flat_mm`, its seams with it."""
+        return replace(self, flat_mm=flat_mm, seams=tuple(seam.measured(flat_mm) for seam in self.seams))
 
     def scaled(self, factor_ratio: float) -> Flattening:
         """Return the same with the flat `factor_ratio` times as large, and so the expansions that much smaller."""

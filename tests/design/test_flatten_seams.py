@@ -105,6 +105,19 @@ def test_a_tube_is_scaled_to_whole_cells() -> None:
     assert flatten(cap(edge_mm=12)).whole_cell_scales(10.0, 0.5, 2) == []
 
 
+@pytest.mark.parametrize("asked", [FlattenOptions(), FlattenOptions(cones_count=2)])
+def test_seams_turn_and_shift_with_their_flat(asked: FlattenOptions) -> None:
+    flat = flatten(vase(edge_mm=6) if asked.cones_count == 0 else hemisphere(edge_mm=6), asked)
+    turned_mm = flat.flat_mm @ np.array([[0.6, 0.8], [-0.8, 0.6]]) + [30.0, -7.0]
+    moved = flat.moved_to(turned_mm)
+    for before, seam in zip(flat.seams, moved.seams, strict=True):
+        assert seam.gap_mm < 1e-9
+        assert seam.rotation_rad == pytest.approx(before.rotation_rad)
+        turn = np.exp(1j * seam.rotation_rad)
+        carried = turn * (turned_mm[seam.left] @ [1, 1j]) + complex(*seam.translation_mm)
+        assert carried == pytest.approx(turned_mm[seam.right] @ [1, 1j])
+
+
 def test_an_unrolled_tube_covers_a_period_whole_wherever_its_seam_runs() -> None:
     flat = flatten(vase(edge_mm=6))
     points_mm, faces, face_of = flat.unrolled()
