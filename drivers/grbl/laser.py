@@ -15,8 +15,9 @@ from types import TracebackType
 from drivers.clock import Clock, WallClock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout, ProtocolError, TransportError
 from drivers.grbl.faults import WHO, BoardRestarted
-from drivers.grbl.link import ANSWER_S, HOLD, JOG_CANCEL, RESET, START, STATUS, Link, alarm
+from drivers.grbl.link import ANSWER_S, DOOR, HOLD, JOG_CANCEL, RESET, START, STATUS, Link, alarm
 from drivers.grbl.messages import Alarm, Banner, Message, Report, Vector
+from drivers.grbl.overrides import Override, override_bytes
 from drivers.grbl.settings import Identity, identify
 from drivers.grbl.stream import bare
 from drivers.transport import Transport
@@ -86,11 +87,15 @@ class Laser:
         return self.identity
 
     def _wake(self) -> None:
-        """Ask `?` until something answers; a board locked by a soft limit does not, and is reset all the same."""
+        """Ask `?` until a report comes; a board locked by a soft limit gives none, and is reset all the same.
+
+        What lay in the line from before is thrown away first: an old banner says nothing about now.
+        """
+        self.link.drain()
         end_s = self.clock.now_s() + WAKE_S
         while self.clock.now_s() < end_s:
             self.link.send(STATUS)
-            came, _ = self.link.wait_for(lambda m: isinstance(m, Report | Banner), REPEAT_S)
+            came, _ = self.link.wait_for(lambda m: isinstance(m, Report), REPEAT_S)
             if came:
                 return
 
@@ -178,6 +183,18 @@ class Laser:
         if report.state in ("Hold", "Door"):
             self._quiet = False
             self.link.send(START)
+
+    def open_door(self) -> None:
+        """Do what an opening door does: hold, and switch beam and air off; `resume` goes on once it is closed."""
+        self._quiet = False
+        self.link.send(DOOR)
+
+    def override(self, which: Override, percent: int) -> Report:
+        """Set the feed, rapid or power override and return the report that shows it."""
+        for code in override_bytes(which, percent):
+            self.link.send(code)
+            self.report()  # the board takes one step of a kind at a time
+        return self.report()
 
     def jog(self, x_mm: float, y_mm: float, feed_mm_s: float) -> None:
         """Move by so much, beam off, at most; returns when it stands there. Ctrl-C cancels the jog."""

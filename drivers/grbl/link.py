@@ -15,6 +15,7 @@ STATUS, START, HOLD, RESET = b"?", b"~", b"!", b"\x18"
 DOOR, JOG_CANCEL = b"\x84", b"\x85"
 STEP_S = 0.02
 ANSWER_S = 3.0
+DRAINS_COUNT = 32
 
 
 def alarm(code: int) -> DeviceAlarm:
@@ -45,6 +46,14 @@ class Link:
             elif isinstance(message, Garbled):
                 self.garbled.append(message.text)
         return found
+
+    def drain(self) -> None:
+        """Throw away what has come in so far."""
+        for _ in range(DRAINS_COUNT):  # a device that never stops talking must not hold us here
+            if not self.transport.read(0.0):
+                break
+        self.listener.clear()
+        self.report = None
 
     def wait_for(self, wanted: Callable[[Message], bool], timeout_s: float) -> tuple[bool, list[Message]]:
         """Receive until `wanted` accepts a message or time is up; return whether it came, and all that came."""
