@@ -278,3 +278,28 @@ def test_a_relaxed_state_says_when_it_did_not_arrive() -> None:
     m = model(T_MM, THETA_RAD, SHEET)
     state = relax(m, m.rest, 1.3, steps_count=1)
     assert not state.converged and state.residual_ratio > 1e-6
+
+
+def test_gradient_and_hessian_of_the_periodic_cell_match_differences(solved: tuple[Model, Pair]) -> None:
+    m, pair = solved
+    s = pair.saddle.s_ratio
+    cell = periodic_cell(m)
+    rng = np.random.default_rng(11)
+    place = positions(cell, m, m.nodes(pair.saddle.y, s), s) + 3e-4 * rng.standard_normal(cell.rest_mm.shape)
+    F = np.array([[s, 2e-4], [2e-4, s - 3e-4]])
+    way, strain = 0.01 * rng.standard_normal(place.shape), np.array([0.01, -0.02, 0.01])
+    way[0] = 0
+    turn = np.array([[strain[0], strain[2]], [strain[2], strain[1]]])
+    at = derivatives(cell, place, F)
+    assert at is not None
+    e = 1e-4
+
+    def energy(h: float) -> float:
+        return cell.energy_mm2(place + h * way, F + h * turn)
+
+    slope = (8 * (energy(e) - energy(-e)) - (energy(2 * e) - energy(-2 * e))) / (12 * e)
+    curve = (16 * (energy(e) + energy(-e)) - (energy(2 * e) + energy(-2 * e)) - 30 * energy(0)) / (12 * e * e)
+    free = way.ravel()[2:]
+    assert slope == pytest.approx(at.grad @ free + at.stress @ strain, rel=1e-6)
+    mixed = 2 * free @ at.mixed @ strain + strain @ at.strain_hessian @ strain
+    assert curve == pytest.approx(free @ (at.hessian @ free) + mixed, rel=1e-6)
