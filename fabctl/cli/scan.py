@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import bench_option, json_option, lab, progress, say, show
-from fabctl.errors import FabctlError, RefusedError, Stopped, UsageError
+from fabctl.errors import REFUSED, FabctlError, RefusedError, Stopped, UsageError
 
 if TYPE_CHECKING:
+    from fabctl.events import Event
+    from fabctl.records.folder import RunFolder
     from fabctl.scan.job import Request
     from fabctl.workspace import Specimen, Workspace
 
@@ -40,6 +42,13 @@ def command() -> None:
 @click.option("--board", type=FILE, help="The board as measured: label,x,y,z in mm.")
 @click.option("--datum", type=FILE, help="Three or more points as scanned: label,x,y,z in cloud units.")
 @click.option("--datum-target", type=FILE, help="The same points on the target: label,x,y,z in mm.")
+@click.option(
+    "--mode",
+    type=click.Choice(["best-fit", "least-squares", "datum", "rim", "gravity-and-rim"]),
+    default="best-fit",
+    show_default=True,
+    help="Rules of the alignment.",
+)
 @click.option("--tolerance-frac", type=click.FloatRange(min=0, min_open=True), help="Of the bounding-box diagonal.")
 @click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same answer.")
 @bench_option
@@ -53,6 +62,7 @@ def run_scan(
     board: Path | None,
     datum: Path | None,
     datum_target: Path | None,
+    mode: str,
     tolerance_frac: float | None,
     seed: int,
     bench_name: str,
@@ -77,6 +87,7 @@ def run_scan(
         "board": board,
         "datum_cloud": datum,
         "datum_target": datum_target,
+        "mode": mode,
         "tolerance_frac": tolerance_frac,
         "seed": seed,
     }
@@ -87,6 +98,71 @@ def run_scan(
         raise UsageError("give the cloud's file")
     fresh = _fetch(here, bench_name, specimen, seed)
     return _run(here, Request(fresh, mesh, predicted, **options), specimen, as_json)
+
+
+@command.command("batch")
+@click.argument("clouds", nargs=-1, required=True, type=FILE)
+@click.option("--target", type=FILE, required=True, help="Target mesh of all the clouds.")
+@click.option("--scale", type=click.Choice(["free", "known"]), default="free", show_default=True)
+@click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
+@click.option("--tolerance-frac", type=click.FloatRange(min=0, min_open=True), help="Of the bounding-box diagonal.")
+@click.option("--seed", type=int, default=0, show_default=True)
+@json_option
+def run_batch(
+    clouds: tuple[Path, ...],
+    target: Path,
+    scale: str,
+    unit_mm: float,
+    tolerance_frac: float | None,
+    seed: int,
+    as_json: bool,
+) -> int:
+    """Compare many CLOUDS with one target; a run record each. The exit code is that of the worst."""
+    from fabctl.scan.job import Request
+
+    here, worst = lab(), 0
+    rows: list[dict[str, Any]] = []
+    for cloud in clouds:
+        options: dict[str, Any] = {"scale": scale, "unit_mm": unit_mm, "tolerance_frac": tolerance_frac, "seed": seed}
+        try:
+            run, body, code = _compared(here, Request(cloud, target, **options), None)
+        except (RefusedError, UsageError) as fault:  # one bad file must not lose the others
+            rows.append(
+                {"cloud": str(cloud), "verdict": "undecided", "error": str(fault), "exit_code": fault.exit_code}
+            )
+            worst = max(worst, fault.exit_code)
+            continue
+        found = body.get("deviation") or {}
+        row = {"cloud": str(cloud), "run": run.run_id, "status": body["status"], "verdict": body["verdict"]}
+        rows.append({**row, "rms_mm": found.get("rms_mm"), "rms_frac": found.get("rms_frac"), "exit_code": code})
+        worst = max(worst, code)
+    lines = [
+        f"{Path(r['cloud']).name:32} {r['verdict']:18} {r.get('rms_mm') or float('nan'):9.3f} mm rms" for r in rows
+    ]
+    show({"scans": rows}, as_json, lines)
+    return worst
+
+
+@command.command("compare")
+@click.argument("first")
+@click.argument("second")
+@json_option
+def compare_scans(first: str, second: str, as_json: bool) -> None:
+    """Say how well scan run SECOND repeats FIRST: two scans of one specimen, or of one target."""
+    from dataclasses import asdict
+
+    from fabctl.records.folder import open_run
+    from fabctl.scan.repeat import compare_runs
+
+    here = lab()
+    runs = [open_run(Path(name) if Path(name).is_dir() else here.runs / name) for name in (first, second)]
+    found = compare_runs(*runs)
+    lines = [
+        f"repeatability {found.repeatability_mm:.3f} mm (one scan, bias removed); bias {found.bias_mm:+.3f} mm",
+        f"difference rms {found.rms_mm:.3f} mm, 95 % within {found.p95_abs_mm:.3f} mm; "
+        f"correlation {found.correlation_ratio:.2f} over {found.common_frac:.0%} of the target",
+    ]
+    show({"first": first, "second": second, **asdict(found)}, as_json, lines)
 
 
 def _named(here: Workspace, words: tuple[str, ...], target: Path | None) -> tuple[Specimen | None, Path | None]:
@@ -155,6 +231,15 @@ def _newest(inbox: Path) -> Path:
 
 def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: bool) -> int:
     """Compare, write the run record, show the result; return the exit code."""
+    run, body, code = _compared(here, request, specimen)
+    page = run.artefact("report.html")
+    data = {"run": run.run_id, "folder": str(run.path), "report": str(page), **body}
+    show(data, as_json, _lines(body, page))
+    return code
+
+
+def _compared(here: Workspace, request: Request, specimen: Specimen | None) -> tuple[RunFolder, dict[str, Any], int]:
+    """Compare and write the run record; return it with the result and the exit code."""
     from fabctl.records.folder import start_run
     from fabctl.reports.scan import write_scan_report
     from fabctl.scan.job import compare, record
@@ -163,27 +248,26 @@ def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: 
     if missing:
         raise UsageError(f"no such file: {', '.join(missing)}")
     name = None if specimen is None else specimen.name
-    config = {k: getattr(request, k) for k in ("scale", "unit_mm", "tolerance_frac")}
+    config = {k: getattr(request, k) for k in ("scale", "unit_mm", "mode", "tolerance_frac")}
     run = start_run(here.runs, "scan", specimen=name, inputs=request.files(), config=config, seed=request.seed)
     log, live = run.log_events(), progress()
 
-    def emit(event: Any) -> None:
+    def emit(event: Event) -> None:
         log(event)
         live(event)
 
     try:
         made = compare(request, emit)
         body = record(run, made)
-        page = write_scan_report(run)
     except KeyboardInterrupt:
         run.finish("stopped", "stopped by the operator")
         raise Stopped("stopped") from None
     except Exception as fault:
         run.finish("refused" if isinstance(fault, RefusedError) else "failed", str(fault))
         raise
-    run.finish("refused" if made.exit_code == 3 else "done", _sentence(body), verdict=body["verdict"])
-    show({"run": run.run_id, "folder": str(run.path), "report": str(page), **body}, as_json, _lines(body, page))
-    return made.exit_code
+    run.finish("refused" if made.exit_code == REFUSED else "done", _sentence(body), verdict=body["verdict"])
+    write_scan_report(run)
+    return run, body, made.exit_code
 
 
 def _sentence(body: dict[str, Any]) -> str:

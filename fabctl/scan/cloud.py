@@ -96,12 +96,23 @@ def _read_open3d(path: Path, kind: str, seed: int) -> Cloud:
         if mesh is not None and len(mesh.triangles) > 0:
             return _sampled(mesh, path, seed)
         if kind == ".obj" and mesh is not None:
-            return Cloud(np.asarray(mesh.vertices, dtype=np.float64), None, None, path)
+            return Cloud(_obj_vertices(path), None, None, path)
         read = o3d.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
     points = np.array(read.points, dtype=np.float64)
     normals = np.array(read.normals) if read.has_normals() else None
     colours = np.round(255 * np.array(read.colors)).astype(np.uint8) if read.has_colors() else None
     return Cloud(points, normals, colours, path)
+
+
+def _obj_vertices(path: Path) -> Floats:
+    """Return the `v` lines of an OBJ file that has no faces; open3d reads none of those."""
+    rows = [line.split()[1:4] for line in path.read_bytes().splitlines() if line.startswith(b"v ")]
+    try:
+        return np.array([[float(x) for x in row] for row in rows], dtype=np.float64).reshape(-1, 3)
+    except ValueError as fault:
+        raise RefusedError(
+            f"{path}: cannot be compared", [Finding("SCAN-TEXT", f"a vertex is not three numbers: {fault}")]
+        ) from fault
 
 
 def _sampled(mesh: Any, path: Path, seed: int) -> Cloud:

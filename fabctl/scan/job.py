@@ -21,6 +21,7 @@ from fabctl.scan.colours import colours_of, span_mm
 from fabctl.scan.deviation import Deviation, Statistics, Uncertainty, bootstrap, deviate, statistics
 from fabctl.scan.judge import Judged
 from fabctl.scan.markers import Scale, scale_from_board
+from fabctl.scan.modes import Mode, aligned_by
 from fabctl.scan.refine import Options, refine
 from fabctl.scan.register import FINAL_POINTS, Datums, Registration, Task, register
 from fabctl.scan.symmetry import Symmetries, find_symmetries
@@ -46,6 +47,7 @@ class Request:
     board: Path | None = None  # label,x,y,z in mm
     datum_cloud: Path | None = None  # label,x,y,z in cloud units
     datum_target: Path | None = None  # label,x,y,z in mm, in the target's frame
+    mode: Mode = "best-fit"
     tolerance_frac: float | None = None
     seed: int = 0
 
@@ -119,12 +121,21 @@ def compare(request: Request, emit: Emit = silent) -> Comparison:
     known = None if scale is None else scale.unit_mm
     task = Task(cloud.points, cleaned, target, symmetries, known, read_datums(request), request.seed, emit)
     registration = register(task)
+    registration = _by_mode(request.mode, task, registration)
     made = Comparison(request, target, cloud, cleaned, registration, scale)
     findings = [*cloud.findings, *registration.findings]
     if registration.status not in ("aligned", "symmetric") or registration.best is None:
         return replace(made, findings=tuple(findings))
     emit(Event("stage", "measuring deviations"))
     return _measured(made, symmetries, findings)
+
+
+def _by_mode(mode: Mode, task: Task, found: Registration) -> Registration:
+    """Return the registration with the pose that the alignment mode asks for."""
+    if mode == "best-fit" or found.best is None or found.status not in ("aligned", "symmetric"):
+        return found
+    fit = aligned_by(mode, task, task.points[found.specimen], found.best.fit)
+    return replace(found, best=replace(found.best, fit=fit))
 
 
 def known_scale(request: Request) -> Scale | None:
@@ -209,6 +220,7 @@ def result(made: Comparison) -> dict[str, Any]:
         "verdict": made.verdict,
         "status": registration.status,
         "decided_by": registration.decided_by,
+        "mode": made.request.mode,
         "tolerance_frac": made.request.tolerance_frac,
         "share_within_required_frac": SHARE_WITHIN_FRAC,
         "target": {"name": made.target.name, "diagonal_mm": size, "symmetries": registration.symmetries.describe()},
