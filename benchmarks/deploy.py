@@ -1,0 +1,381 @@
+"""Figures of the deployed shape: `python -m benchmarks deploy [PART …]`.
+
+Parts: derivatives, forms, targets, caps, gravity, compensation, time.
+
+The published targets are read from `$FABCTL_SHARED` or `shared` beside the project; without them those figures are left
+out and said to be.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import Figure
+from design.cells.bending_map import load_bending
+from design.cells.library import load_library
+from design.cells.select import SelectionOptions, on_curve, selection_curve
+from design.cells.sheet import Sheet
+from design.deploy.compensate import Compensation, compensate
+from design.deploy.designed import designed_layout, lift
+from design.deploy.equilibrium import from_flat, solve_level
+from design.deploy.indentation import Response, border, indentation_response
+from design.deploy.levels import Layout
+from design.deploy.newton import System, factorise, pins, solve
+from design.deploy.predict import compared
+from design.deploy.search import equilibria
+from design.deploy.shell import Shell, build_shell
+from design.deploy.supports import settle, weight_of
+from design.flatten import flatten
+from design.meshfiles import read_mesh
+from design.pattern.assign import averaged
+from design.pattern.tiling import tile
+from design.surface import TriMesh
+
+Reals = NDArray[np.float64]
+SHEET = Sheet()
+PRESCRIBED_MJ = 0.1 * 1.5 * 2.3**3 / 12  # the solver check's bending stiffness
+CAP_MM, APEX = 80.0, {"low": 1.505, "high": 1.775}
+
+
+def measure(words: list[str]) -> list[Figure]:
+    """Return the figures of the parts named, of all where none is."""
+    parts: dict[str, Callable[[], list[Figure]]] = {
+        "derivatives": derivatives, "forms": closed_forms, "targets": solver_check, "caps": two_caps,
+        "gravity": gravity, "compensation": compensation, "time": times,
+    }  # fmt: skip
+    wanted = [word for word in words if not word.startswith("-")] or list(parts)
+    return [figure for word in wanted for figure in parts[word]()]
+
+
+def most(name: str, value: float, limit: float, unit: str, target: str, n: int) -> Figure:
+    """Return a figure that must not exceed its limit."""
+    return Figure(name, round(float(value), 12), unit, target, bool(value <= limit), n)
+
+
+def properties(expansion: Reals) -> tuple[Reals, Reals, Reals]:
+    """Return Y, ν and D of the stiffest cells of these expansions."""
+    library = load_library()
+    curve = selection_curve(library, SelectionOptions(rule="stiffest"))
+    chosen = on_curve(curve, np.clip(expansion, *curve.range_ratio()))
+    at = library.at(chosen.t_mm, chosen.theta_rad)
+    nu = np.where(np.isfinite(at.nu_tangent_ratio), at.nu_tangent_ratio, np.nanmean(at.nu_tangent_ratio))
+    flat_mm2 = 6 * np.sqrt(3) / 4 * SHEET.edge_mm**2
+    return chosen.stiffness_mJ / flat_mm2, nu, load_bending().D_mJ(chosen.expansion_ratio, chosen.theta_rad, SHEET)
+
+
+def cap(apex: float, edge_mm: float, D_mJ: float | None = None) -> tuple[Layout, Reals]:
+    """Return the half-angle-60° cap's layout, stereographic, and where its vertices belong; `D_mJ` None: computed."""
+    reach = 2 * CAP_MM / apex
+    radius = reach * np.tan(np.pi / 6)
+    ring = np.linspace(0, 2 * np.pi, 181)[:-1]
+    disk = np.vstack([[0.0, 0.0], radius * np.column_stack([np.cos(ring), np.sin(ring)])])
+    fan = np.array([[0, k + 1, (k + 1) % 180 + 1] for k in range(180)])
+    tiling = tile(disk, fan, edge_mm)
+    centre = tiling.centres_mm()
+    lam = apex / (1 + np.sum((centre / reach) ** 2, axis=1))
+    Y, nu, D = properties(lam)
+    layout, _ = designed_layout(tiling.vertices_mm, tiling.cells, lam, Y, nu, D if D_mJ is None else np.array(D_mJ))
+    flat = layout.flat_mm()
+    polar, turn = 2 * np.arctan(np.hypot(*flat.T) / reach), np.arctan2(flat[:, 1], flat[:, 0])
+    goal = CAP_MM * np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
+    return layout, goal
+
+
+def sphere_deviation_mm(x: Reals, layout: Layout) -> tuple[float, Reals]:
+    """Return the mean distance of the units from the sphere fitted with its own radius, and the shape about it."""
+    from scipy.optimize import least_squares
+
+    from design.deploy.compare import surface_samples
+
+    points, area = surface_samples(x, layout.cells)
+
+    def gap(centre: Reals) -> Reals:
+        return np.asarray((np.linalg.norm(points - centre, axis=1) - CAP_MM) * np.sqrt(area))
+
+    centre = least_squares(gap, x.mean(axis=0) - [0, 0, 60]).x
+    return float(np.average(np.abs(np.linalg.norm(points - centre, axis=1) - CAP_MM), weights=area)), x - centre
+
+
+def derivatives() -> list[Figure]:
+    """Return the error of gradient and Hessian against differences, and of the equilibrium."""
+    layout, goal = cap(1.505, 10.0)
+    system = System(layout.shell())
+    rng = np.random.default_rng(1)
+    x, way, h = goal + rng.normal(size=goal.shape), rng.normal(size=goal.shape), 1e-5
+    slope = (system.energy(x + h * way) - system.energy(x - h * way)) / (2 * h)
+    force = (system.gradient(x + h * way)[1] - system.gradient(x - h * way)[1]) / (2 * h)
+    found = (system.linearise(x)[2] @ way.ravel()).reshape(way.shape)
+    rest = from_flat(layout)
+    asked = "gradient and Hessian against differences: 1e-6 relative"
+    return [
+        most("gradient", abs(np.sum(system.gradient(x)[1] * way) / slope - 1), 1e-6, "", asked, x.size),
+        most("Hessian", np.abs(found - force).max() / np.abs(force).max(), 1e-6, "", asked, x.size),
+        most("residual at rest", rest.residual_ratio, 1e-8, "", "max|g|/(median k_d·l0) ≤ 1e-8", x.size),
+    ]
+
+
+def closed_forms() -> list[Figure]:
+    """Return the errors against a sphere, a clamped plate, a point-loaded shell and a cylinder."""
+    sphere = [_sphere_radius_error(edge) for edge in (4.0, 2.0)]
+    plates = np.array([_clamped_plate_error(edge) for edge in (5.0, 2.5, 1.25)])
+    shell = _point_load_error()
+    return [
+        most("sphere radius", abs(sphere[1]), 1e-3, "", "sphere radius 0.1 % (bending → 0)", 2),
+        most("clamped plate", abs(2 * plates[2] - plates[1]), 0.02, "", "clamped plate 2 % (extrapolated)", 3),
+        Figure("clamped plate, finest mesh", float(plates[2]), "", "", None, 1),
+        most("point-loaded shell", abs(shell), 0.05, "", "Reissner point load 5 %", 1),
+        most("cylinder", abs(_cylinder_error()), 0.01, "", "cylinder bending 1 %", 1),
+    ]
+
+
+def _sphere_radius_error(edge_mm: float) -> float:
+    layout, goal = cap(1.505, edge_mm, 1e-4 * edge_mm**2)
+    x = solve_level(layout, goal).x_mm
+    fit = np.linalg.lstsq(np.column_stack([2 * x, np.ones(len(x))]), np.sum(x**2, axis=1), rcond=None)[0]
+    return float(np.sqrt(fit[3] + fit[:3] @ fit[:3])) / CAP_MM - 1
+
+
+def _disk(radius_mm: float, edge_mm: float, beyond_mm: float) -> tuple[Reals, NDArray[np.int64]]:
+    ring = np.linspace(0, 2 * np.pi, 361)[:-1]
+    rim = (radius_mm + beyond_mm) * np.column_stack([np.cos(ring), np.sin(ring)])
+    fan = np.array([[0, k + 1, (k + 1) % 360 + 1] for k in range(360)])
+    tiling = tile(np.vstack([[0.0, 0.0], rim]), fan, edge_mm)
+    used, cells = np.unique(tiling.cells, return_inverse=True)
+    cells = cells.reshape(-1, 3)
+    cells[tiling.inverted] = cells[tiling.inverted][:, ::-1]
+    return tiling.vertices_mm[used], cells
+
+
+def _clamped_plate_error(edge_mm: float) -> float:
+    """Return the error of q·a⁴/(64·D) at the middle of a clamped round plate; linear, about the flat state."""
+    radius, D, q = 40.0, 0.7, 1e-6
+    flat, cells = _disk(radius, edge_mm, 3 * edge_mm)
+    shell = build_shell(cells, 1.0, 0.2, 0.3, D, edge_mm, len(flat))
+    system = System(shell)
+    x = np.column_stack([flat, np.zeros(len(flat))])
+    fixed = np.repeat((np.hypot(*flat.T) >= radius)[:, None], 3, axis=1)
+    load = np.zeros_like(x)
+    load[:, 2] = q * np.bincount(cells.ravel(), np.repeat(shell.area_mm2, 3) / 3, len(flat))
+    load[fixed] = 0
+    matrix = system.held(system.linearise(x)[2], fixed)
+    w = factorise(matrix)[0].solve(load.ravel()).reshape(x.shape)[:, 2]
+    return float(w[int(np.argmin(np.hypot(*flat.T)))] / (q * radius**4 / (64 * D)) - 1)
+
+
+def _point_load_error() -> float:
+    """Return the error of Reissner's stiffness 8√(D·Y)/R under a point load at the apex; linear."""
+    layout, goal = cap(1.505, 1.6, 0.15)
+    even = replace(layout, Y_N_mm=np.full(len(layout.cells), 0.2), nu_ratio=np.full(len(layout.cells), 0.3))
+    x = solve_level(even, goal).x_mm
+    system = System(even.shell())
+    top = int(np.argmin(np.hypot(*even.flat_mm().T)))
+    normal = _normal(x, even, top)
+    fixed = pins(x)
+    fixed[top] = False
+    rim = np.linalg.norm(x - x[top], axis=1) > 60
+    load = np.zeros_like(x)
+    load[top] = normal
+    u = factorise(system.held(system.linearise(x)[2], np.repeat(rim[:, None], 3, axis=1)))[0].solve(load.ravel())
+    return float(1 / (u.reshape(x.shape)[top] @ normal) / (8 * np.sqrt(0.15 * 0.2) / CAP_MM) - 1)
+
+
+def _normal(x: Reals, layout: Layout, vertex: int) -> Reals:
+    a, b, c = (x[layout.cells[np.any(layout.cells == vertex, axis=1), k]] for k in range(3))
+    normal = np.cross(b - a, c - a).sum(axis=0)
+    return np.asarray(normal / np.linalg.norm(normal))
+
+
+def _cylinder_error() -> float:
+    """Return the error of ½Dκ² per area for a sheet bent to a cylinder askew to its edges."""
+    flat, cells = _disk(60.0, 2.0, 0.0)
+    D, kappa = 0.7, 1 / 100
+    shell: Shell = build_shell(cells, 1.0, 0.2, 0.3, D, 2.0, len(flat))
+    turned = flat @ np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    bent = np.column_stack([np.sin(kappa * turned[:, 0]) / kappa, turned[:, 1], np.cos(kappa * turned[:, 0]) / kappa])
+    from design.deploy.newton import fold_angles
+
+    energy = 0.5 * shell.fold_mJ * fold_angles(bent, shell.hinges) ** 2
+    side = flat[shell.hinges[:, 1]] - flat[shell.hinges[:, 0]]
+    turn = np.rint(np.arctan2(side[:, 1], side[:, 0]) / (np.pi / 3)).astype(int) % 3
+    per_pair = sum(float(energy[turn == k].mean()) for k in range(3))
+    return per_pair / (0.5 * D * kappa**2 * 2 * float(shell.area_mm2[0])) - 1
+
+
+def published(name: str) -> TriMesh | None:
+    """Return a published target, None where it is not here."""
+    root = Path(os.environ.get("FABCTL_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+    path = root / "published" / "targets" / f"{name}.obj"
+    return read_mesh(path)[0] if path.is_file() else None
+
+
+def tiled(mesh: TriMesh, count: int | None, D_mJ: float | None) -> tuple[Layout, Reals]:
+    """Return a target's layout of about `count` units (None: 10 mm cells) and where its vertices belong."""
+    flat = flatten(mesh)
+    scale = 1.75 / float(np.quantile(flat.expansion_ratio, 0.99))
+    expansion, points = flat.expansion_ratio * scale, flat.flat_mm / scale
+    area = float(np.sum(mesh.face_areas_mm2() / expansion**2))
+    edge = SHEET.edge_mm if count is None else float(np.sqrt(area / count / np.sqrt(0.1875)))
+    cells = tile(points, flat.faces, edge)
+    lam = averaged(cells, points, flat.faces, expansion**2, "exact")
+    Y, nu, D = properties(lam)
+    layout, _ = designed_layout(cells.vertices_mm, cells.cells, lam, Y, nu, D if D_mJ is None else np.array(D_mJ))
+    return layout, lift(layout.flat_mm(), points, flat.faces, flat.mesh.vertices_mm, flat.mesh.faces)
+
+
+def solver_check() -> list[Figure]:
+    """Return the deviations with prescribed and computed bending stiffness."""
+    figures = []
+    edge = float(np.sqrt(np.pi * (2 * CAP_MM / 1.75 * np.tan(np.pi / 6)) ** 2 / 920 / np.sqrt(0.1875)))
+    diagonal = float(np.linalg.norm([2 * CAP_MM * np.sin(np.pi / 3)] * 2 + [CAP_MM / 2]))
+    for name, D, asked in (("prescribed D", PRESCRIBED_MJ, 0.12), ("computed D, 10 mm cells", None, None)):
+        layout, _ = cap(1.75, edge if D else 10.0, D)
+        found = from_flat(layout)
+        percent = 100 * sphere_deviation_mm(found.x_mm, layout)[0] / diagonal
+        figures.append(_deviation(f"cap, {name}", percent, asked, len(layout.cells)))
+    for target, limit in (("double_dome", 0.30), ("lilium_tower", 1.5)):
+        mesh = published(target)
+        if mesh is None:
+            figures.append(Figure(target, "published target not here", "", f"≤ {limit} %", None, 0))
+            continue
+        for name, D, asked in (("prescribed D", PRESCRIBED_MJ, limit), ("computed D, 10 mm cells", None, None)):
+            layout, goal = tiled(mesh, 920 if D else None, D)
+            figures += _every_shape(f"{target}, {name}", layout, goal, mesh, asked)
+    figures.append(
+        Figure("welded vase, prescribed D", "not measured: no seam in this benchmark", "", "≤ 1.1", False, 0)
+    )
+    return figures
+
+
+def _every_shape(name: str, layout: Layout, goal: Reals, mesh: TriMesh, asked: float | None) -> list[Figure]:
+    shapes, lost = equilibria(layout, goal, 4, seed=1)
+    rows = [compared(layout, shape.equilibrium, mesh, goal).deviation.mean_frac * 100 for shape in shapes]
+    energies = ", ".join(f"{s.equilibrium.energy_mJ:.3f} mJ: {r:.2f} %" for s, r in zip(shapes, rows, strict=True))
+    return [
+        _deviation(name, min(rows), asked, len(layout.cells)),
+        Figure(f"{name}: every equilibrium", energies, "", "reported", None, len(shapes)),
+        Figure(f"{name}: starts without an answer", len(lost), "", "", None, len(lost) + len(shapes)),
+    ]
+
+
+def _deviation(name: str, percent: float, asked: float | None, n: int) -> Figure:
+    target = "reported" if asked is None else f"mean deviation ≤ {asked} % of the diagonal"
+    return Figure(name, round(percent, 4), "%", target, None if asked is None else bool(percent <= asked), n)
+
+
+def press(apex: float, D_of: Callable[[Layout], Reals] | None = None, parts: int = 4) -> tuple[Response, Layout]:
+    """Return the response at the apex of a 10 mm cap: sphere of R/10, rim held."""
+    layout, goal = cap(apex, 10.0)
+    if D_of is not None:
+        layout = replace(layout, D_mJ=D_of(layout))
+    found = solve_level(layout, goal)
+    _, x = sphere_deviation_mm(found.x_mm, layout)
+    return indentation_response(layout, x, CAP_MM / 10, 4.0, 16, parts=parts), layout
+
+
+def two_caps() -> list[Figure]:
+    """Return the ratio of the paper's two caps, with the computed D and with other assumptions about it."""
+    figures: list[Figure] = []
+    low, high = (press(APEX[name]) for name in ("low", "high"))
+    depths = (0.5, 1.0, 2.0, 3.0, 4.0)
+    ratios = [low[0].stiffness_N_mm(d) / high[0].stiffness_N_mm(d) for d in depths]
+    figures.append(
+        Figure("low cap over high cap, secant to 2 mm, computed D", round(ratios[2], 3), "", "between 1.6 and 2.5",
+               bool(1.6 <= ratios[2] <= 2.5), len(low[1].cells) + len(high[1].cells))
+    )  # fmt: skip
+    fall = ", ".join(f"{d:g} mm: {r:.2f}" for d, r in zip(depths, ratios, strict=True))
+    figures.append(Figure("its fall with depth", fall, "", "reported", None, len(depths)))
+    for name, (response, layout) in (("low", low), ("high", high)):
+        rising = bool(np.all(np.diff(response.load_N) > 0))
+        figures += [
+            Figure(f"{name} cap, secant to 2 mm", round(response.stiffness_N_mm(2.0), 5), "N/mm", "", None,
+                   len(layout.cells)),
+            Figure(f"{name} cap: load never falls", rising, "", "no collapse", rising, len(response.depth_mm)),
+            most(f"{name} cap: left after release", response.recovered_mm, 1e-3, "mm", "recovery on release", 1),
+            most(f"{name} cap: worst residual", response.residual_ratio, 1e-8, "", "≤ 1e-8", len(response.depth_mm)),
+        ]  # fmt: skip
+    constant = [press(APEX[n], lambda layout: np.full(len(layout.cells), PRESCRIBED_MJ))[0] for n in ("low", "high")]
+    shift = constant[0].stiffness_N_mm(2.0) / constant[1].stiffness_N_mm(2.0)
+    figures.append(Figure("the ratio with D constant", round(shift, 3), "", "reported", None, 2))
+    share = float(np.mean(low[1].D_mJ / low[1].Y_N_mm))
+    linear = [press(APEX[n], lambda layout: share * layout.Y_N_mm)[0] for n in ("low", "high")]
+    ratio = linear[0].stiffness_N_mm(2.0) / linear[1].stiffness_N_mm(2.0)
+    figures.append(Figure("the ratio with D ∝ Y", round(ratio, 3), "", "cross-check", None, 2))
+    return figures
+
+
+def gravity() -> list[Figure]:
+    """Return how far both caps sag on each support."""
+    figures, sags = [], {}
+    for name, apex in APEX.items():
+        layout, goal = cap(apex, 10.0)
+        _, x = sphere_deviation_mm(solve_level(layout, goal).x_mm, layout)
+        for support in ("held", "no-slip", "coulomb", "slip"):
+            found = settle(layout, x, SHEET, support)
+            sags[name, support] = found.sag_mm
+            figures.append(Figure(f"{name} cap sags, {support}", round(found.sag_mm, 4), "mm", "", None, 1))
+    more = sags["high", "no-slip"] / sags["low", "no-slip"]
+    asked = "the high cap sags more with a rim that does not slip"
+    return [*figures, Figure("sag, high over low, no slip", round(more, 3), "", asked, bool(more > 1), 2)]
+
+
+def compensation() -> list[Figure]:
+    """Return how much nearer changed expansions bring a free dome and a cap that is held and heavy."""
+    figures: list[Figure] = []
+    bounds = load_library().range_ratio()
+    mesh = published("double_dome")
+    if mesh is None:
+        figures.append(Figure("double_dome compensated", "published target not here", "", "≥ 3 times", None, 0))
+    else:
+        layout, goal = tiled(mesh, None, None)
+        before = compared(layout, solve_level(layout, goal), mesh, goal).deviation
+        found = compensate(layout, goal, bounds)
+        after = compared(found.layout, found.equilibrium, mesh, goal).deviation
+        figures += _gains("double_dome", found, before.rms_mm, after.rms_mm)
+    layout, goal = cap(1.6, 10.0)
+    loads = [weight_of(layout, SHEET)]
+    rim = np.repeat(border(layout.cells, layout.vertex_count)[:, None], 3, axis=1)
+    heavy = solve(System(layout.shell()), goal, loads, rim)
+    found = compensate(layout, goal, bounds, loads=loads, fixed=rim)
+    rms = [float(np.sqrt(np.mean((np.linalg.norm(e.x_mm, axis=1) - CAP_MM) ** 2))) for e in (heavy, found.equilibrium)]
+    return [*figures, *_gains("heavy cap, rim held at its place", found, *rms)]
+
+
+def _gains(name: str, found: Compensation, before_mm: float, after_mm: float) -> list[Figure]:
+    points, surface = found.before_mm / found.after_mm, before_mm / after_mm
+    n = len(found.layout.cells)
+    return [
+        Figure(f"{name}: points' RMS before over after", round(points, 2), "", "points: ≥ 3 times less RMS",
+               bool(points >= 3), n),
+        Figure(f"{name}: surface RMS before over after", round(surface, 2), "", "≥ 2 times less to the surface",
+               bool(surface >= 2), n),
+        most(f"{name}: residual", found.equilibrium.residual_ratio, 1e-8, "", "≤ 1e-8", n),
+    ]  # fmt: skip
+
+
+def times() -> list[Figure]:
+    """Return CPU seconds from flat (one thread, SciPy alone), compiled code warm."""
+    figures = []
+    from_flat(cap(1.505, 10.0, PRESCRIBED_MJ)[0])
+    seconds, counts = [], []
+    for edge, limit in ((5.2, 2.0), (1.645, 10.0), (1.163, 25.0)):
+        layout, _ = cap(1.505, edge, PRESCRIBED_MJ)
+        begin = time.process_time()
+        found = from_flat(layout)
+        seconds.append(time.process_time() - begin)
+        counts.append(len(layout.cells))
+        figures.append(
+            most(f"from flat, {len(layout.cells)} units ({found.iterations_count} iterations)", seconds[-1], limit,
+                 "s CPU", f"≤ {limit:g} s", len(layout.cells))
+        )  # fmt: skip
+    rate = float(np.polyfit(np.log(counts), np.log(seconds), 1)[0])
+    return [
+        *figures,
+        Figure("growth exponent", round(rate, 2), "", "growth near linear", bool(rate < 1.4), len(counts)),
+    ]
