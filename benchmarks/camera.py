@@ -1,6 +1,7 @@
-"""What the camera measures, against simulated pictures whose truth is known: `python -m benchmarks camera [--quick]`.
+"""What the camera measures, against simulated pictures whose truth is known.
 
-`--quick` takes a tenth of the pictures. Nothing here is fitted to the truth: each figure runs the product's own path
+`python -m benchmarks camera [--quick] [PART…]`; `--quick` takes a tenth of the pictures; the parts are bed, kerf,
+inspection, scale, nothing, ids, refusals. Nothing here is fitted to the truth: each figure runs the product's own path
 from pictures to millimetres, the lens calibration included.
 """
 
@@ -45,17 +46,19 @@ THICKNESS_MM = 2.3
 
 
 def measure(words: list[str]) -> list[Figure]:
-    """Return every figure of the camera."""
+    """Return every figure of the camera, or of the named parts."""
     quick = "--quick" in words
-    return [
-        *_bed(1 if quick else 3),
-        *_kerf(1 if quick else 4),
-        *_inspection(1 if quick else 3),
-        *_scale(1 if quick else 5),
-        *_nothing(100 if quick else 1000),
-        *_ids(40 if quick else 400),
-        *_refusals(),
-    ]
+    parts: dict[str, Callable[[], list[Figure]]] = {
+        "bed": lambda: _bed(1 if quick else 3),
+        "kerf": lambda: _kerf(1 if quick else 4),
+        "inspection": lambda: _inspection(1 if quick else 3),
+        "scale": lambda: _scale(1 if quick else 5),
+        "nothing": lambda: _nothing(100 if quick else 1000),
+        "ids": lambda: _ids(40 if quick else 400),
+        "refusals": _refusals,
+    }
+    chosen = [word for word in words if word in parts] or list(parts)
+    return [figure for name in chosen for figure in parts[name]()]
 
 
 def _camera(seed: int) -> scenes.Camera:
