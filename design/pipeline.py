@@ -46,7 +46,7 @@ class Cells:
     wanted_ratio: Array
     choice: Choice
     hinge_mm: Array
-    kind: tuple[str, ...]  # cut, passive, monostable
+    kind: tuple[str, ...]  # cut or passive
 
     def cut(self) -> NDArray[np.bool_]:
         """Say which cells have slits."""
@@ -90,10 +90,9 @@ def build(
     placed, tiling, wanted, choice = choose(spec, flat, library, curve, found)
     hinge = hinge_widths_mm(choice.expansion_ratio, spec.hinge)
     watch("drawing slits", 0.4)
-    cells = Cells(tiling, wanted, choice, hinge, tuple("cut" for _ in wanted))
+    cells = Cells(tiling, wanted, choice, hinge, kinds_of(spec, tiling))
     drawing, shift = draw(spec, cells, library.sheet)
-    if drawing.id_anchor is None and spec.border.id_height_mm > 0:
-        found.append(Finding("ID-PLACE", "no lower edge has room for the tag: no id can be engraved", "warning"))
+    found += sheet_findings(spec, drawing, placed)
     cells = replace(cells, tiling=tiling.moved(shift))
     placed = placed.moved_to(placed.flat_mm + shift)
     watch("ordering the cut", 0.5)
@@ -101,7 +100,7 @@ def build(
     predicted = None
     if spec.response is not None:
         watch("deploying the sheet", 0.6)
-        predicted = predict(placed, cells.tiling, choice, library, spec.response, watch)
+        predicted = predict(placed, cells.tiling, choice, cells.cut(), library, spec.response, watch)
         found += predicted.findings
     return Design(spec, library.sheet, mesh, placed, cells, drawing, job, predicted, tuple(found), library.hash)
 
@@ -188,6 +187,34 @@ def _faces_range(flat: Flattening) -> tuple[float, float]:
     area = np.cumsum(flat.mesh.face_areas_mm2()[order])
     first, last = np.searchsorted(area, [0.01 * area[-1], 0.99 * area[-1]])
     return float(flat.expansion_ratio[order[first]]), float(flat.expansion_ratio[order[min(last, len(order) - 1)]])
+
+
+def kinds_of(spec: DesignSpec, tiling: Tiling) -> tuple[str, ...]:
+    """Return for each cell whether it is cut or passive."""
+    middle = (tiling.vertices_mm.min(axis=0) + tiling.vertices_mm.max(axis=0)) / 2
+    from_middle = tiling.centres_mm() - middle
+    passive = np.zeros(len(tiling.cells), dtype=bool)
+    for region in spec.passive:
+        passive |= np.linalg.norm(from_middle - [region.x_mm, region.y_mm], axis=1) < region.radius_mm
+    return tuple("passive" if stays else "cut" for stays in passive)
+
+
+def sheet_findings(spec: DesignSpec, drawing: Drawing, flat: Flattening) -> list[Finding]:
+    """Return what is doubtful about the sheet as it is drawn."""
+    found = []
+    if drawing.id_anchor is None and spec.border.id_height_mm > 0:
+        found.append(Finding("ID-PLACE", "no lower edge has room for the tag: no id can be engraved", "warning"))
+    width, height = drawing.size_mm
+    if spec.bed_mm is not None and (width > max(spec.bed_mm) or min(width, height) > min(spec.bed_mm)):
+        bed = f"{spec.bed_mm[0]:g} × {spec.bed_mm[1]:g} mm"
+        text = f"the sheet of {width:.0f} × {height:.0f} mm is larger than the bed of {bed}"
+        found.append(
+            Finding("SHEET-BED", text, "warning", hint="take smaller cells, the high end of expansions, cones")
+        )
+    if flat.seams:
+        text = f"the flat has {len(flat.seams)} seam(s); cells do not run on across them"
+        found.append(Finding("SEAM-OPEN", text, "warning", hint="join the seam's two sides by hand"))
+    return found
 
 
 def draw(spec: DesignSpec, cells: Cells, sheet: Sheet) -> tuple[Drawing, Array]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from design.cells.bending_map import load_bending
 from design.cells.library import CellLibrary
@@ -35,12 +36,13 @@ def predict(
     flat: Flattening,
     tiling: Tiling,
     choice: Choice,
+    cut: NDArray[np.bool_],
     library: CellLibrary,
     options: ResponseOptions,
     watch: Callable[[str, float], None],
 ) -> Predicted:
     """Return what the shell model says of the cells on their sheet. Raises `NotConverged` where it finds no shape."""
-    layout = layout_of(tiling, choice, library)
+    layout = layout_of(tiling, choice, cut, library)
     deployed = deploy(layout, flat.mesh, lifted(flat, tiling.vertices_mm))
     watch("pressing the indenter", 0.8)
     response = indentation_response(
@@ -72,8 +74,8 @@ def _doubts(library: CellLibrary) -> list[Finding]:
     ]
 
 
-def layout_of(tiling: Tiling, choice: Choice, library: CellLibrary) -> Layout:
-    """Return the shell's units: the tiling's cells, counter-clockwise, with their stiffness."""
+def layout_of(tiling: Tiling, choice: Choice, cut: NDArray[np.bool_], library: CellLibrary) -> Layout:
+    """Return the shell's units: the tiling's cells, counter-clockwise, with their stiffness; solid where not cut."""
     sheet = library.sheet
     cells = np.where(tiling.inverted[:, None], tiling.cells[:, ::-1], tiling.cells)
     at = library.at(choice.t_mm, choice.theta_rad)
@@ -81,7 +83,11 @@ def layout_of(tiling: Tiling, choice: Choice, library: CellLibrary) -> Layout:
     nu = np.where(np.isfinite(at.nu_tangent_ratio), at.nu_tangent_ratio, _nearest_nu(choice, library))
     flat_mm2 = 6 * np.sqrt(3) / 4 * sheet.edge_mm**2
     bending = load_bending().D_mJ(choice.expansion_ratio, choice.theta_rad, sheet)
-    return sheet_layout(tiling.vertices_mm, cells, choice.expansion_ratio, choice.stiffness_mJ / flat_mm2, nu, bending)
+    expansion = np.where(cut, choice.expansion_ratio, 1.0)
+    Y = np.where(cut, choice.stiffness_mJ / flat_mm2, sheet.E_MPa * sheet.thickness_mm)
+    nu = np.where(cut, nu, sheet.nu_ratio)
+    bending = np.where(cut, bending, sheet.E_MPa * sheet.thickness_mm**3 / 12)
+    return sheet_layout(tiling.vertices_mm, cells, expansion, Y, nu, bending)
 
 
 def _nearest_nu(choice: Choice, library: CellLibrary) -> Array:

@@ -18,12 +18,8 @@ Infeasible = Literal["report", "cones", "nearest", "both"]
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Cells whose centre lies in a circle of the flat, in sheet millimetres, are treated in their own way.
+    """A circle whose cells are not cut: they stay flat and stiff. `x_mm`, `y_mm` from the middle of the cells' box."""
 
-    `passive` cells are not cut at all; `monostable` ones are cut so that they snap back by themselves.
-    """
-
-    kind: Literal["passive", "monostable"]
     x_mm: float
     y_mm: float
     radius_mm: float
@@ -52,7 +48,7 @@ class DesignSpec:
     selection: SelectionOptions = field(default_factory=SelectionOptions)
     placement: Placement = "optimised"
     hinge: HingeOptions = field(default_factory=HingeOptions)
-    regions: tuple[Region, ...] = ()
+    passive: tuple[Region, ...] = ()
     border: BorderOptions = field(default_factory=BorderOptions)
     tool: ToolOptions = field(default_factory=ToolOptions)
     spread_mm: float = 0.0

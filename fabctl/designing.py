@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from design.bundle import Bundle, write_bundle
 from design.cells.library import CellLibrary, load_library
+from design.cells.select import select
 from design.cells.sheet import Sheet
+from design.compared import Patch, coupon, coupon_csv
+from design.export.dxf import dxf
+from design.export.svg import svg
 from design.findings import Finding
+from design.job import JobOptions, compose_job
 from design.meshfiles import read_mesh
+from design.pattern.drawing import as_json
 from design.pattern.paths import Layer, LayerPreset
+from design.pattern.toolpath import ToolOptions
 from design.pipeline import Design, build
 from design.spec import DesignSpec
 from design.surface import TriMesh
@@ -142,3 +152,26 @@ def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
         "outline": laser.outline,
     }
     return {layer: LayerPreset(c.power_frac, c.feed_mm_s, c.passes_count) for layer, c in layers.items()}
+
+
+def write_coupon(
+    folder: Path, expansion_ratio: float, hinges_mm: list[float], material_name: str, home: Path
+) -> list[Patch]:
+    """Write a coupon's drawing, program and form into a new folder; return its patches."""
+    material = load_material(material_name, home)
+    presets = presets_of(material)
+    assert material.laser is not None
+    sheet = sheet_of(material, material.edge_mm)
+    cell = select(load_library().scaled(sheet), np.array([expansion_ratio]))
+    drawing, patches = coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), hinges_mm, sheet)
+    job = compose_job(drawing, presets, JobOptions(tool=ToolOptions(kerf_mm=material.laser.kerf_mm)))
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        raise UsageError(f"{folder}: exists already; choose another folder") from None
+    (folder / "cut.dxf").write_text(dxf(drawing.paths, drawing.size_mm), encoding="utf-8")
+    (folder / "cut.svg").write_text(svg(drawing.paths, drawing.size_mm, "coupon"), encoding="utf-8")
+    (folder / "cut.nc").write_text("\n".join(job.lines) + "\n", encoding="utf-8")
+    (folder / "paths.json").write_text(json.dumps(as_json(drawing)) + "\n", encoding="utf-8")
+    (folder / "coupon.csv").write_text(coupon_csv(patches), encoding="utf-8")
+    return patches

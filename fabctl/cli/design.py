@@ -96,3 +96,44 @@ def check(target: str, material: str, cell_mm: float | None, remedy: str, pictur
     lines.append("it fits" if fits else "it does not fit")
     show({"target": target, "fits": fits, **found.as_dict()}, as_json, lines)
     raise click.exceptions.Exit(DONE if fits else REFUSED)
+
+
+@command.command()
+@click.argument("a", type=click.Path(path_type=Path))
+@click.argument("b", type=click.Path(path_type=Path))
+@json_option
+def compare(a: Path, b: Path, as_json: bool) -> None:
+    """Compare two design folders: sheet, cells, cutting, deployed shape and stiffness."""
+    from design.bundle import open_bundle
+    from design.compared import compare as compared
+
+    found = compared(open_bundle(a), open_bundle(b))
+    lines = [f"{'':24} {a.name:>14} {b.name:>14}   B over A"]
+    for name, ratio in found["b_over_a_ratio"].items():
+        lines.append(f"{name:24} {found['a'][name]:14.5g} {found['b'][name]:14.5g} {ratio:10.3f}")
+    lines.append(f"{found['cells_at_the_same_place_count']} cells lie at the same place in both")
+    show(found, as_json, lines)
+
+
+@command.command()
+@click.option("--expansion", "expansion_ratio", type=float, default=1.5, show_default=True, help="Of the cell to try.")
+@click.option("--hinges-mm", default="0.20,0.25,0.30,0.35,0.40,0.45", show_default=True, help="Ladder of hinge widths.")
+@click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="New folder for the coupon.")
+@json_option
+def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, as_json: bool) -> None:
+    """Make a sheet of uniform patches, one a hinge width, to check the library on the real material."""
+    from fabctl.designing import write_coupon
+    from fabctl.errors import UsageError
+
+    try:
+        hinges = [float(word) for word in hinges_mm.split(",")]
+    except ValueError:
+        raise UsageError(f"--hinges-mm takes numbers parted by commas, not {hinges_mm!r}") from None
+    patches = write_coupon(output, expansion_ratio, hinges, material, lab().root)
+    lines = [f"{output}: {len(patches)} patches"]
+    for patch in patches:
+        expected = "not bistable" if patch.expansion_ratio is None else f"expands by {patch.expansion_ratio:.4f}"
+        lines.append(f"{patch.label.split()[0]}  hinge {patch.hinge_mm:.3f} mm  {expected}")
+    rows = [{"patch": p.label, "hinge_mm": p.hinge_mm, "expansion_ratio": p.expansion_ratio} for p in patches]
+    show({"folder": str(output), "patches": rows}, as_json, lines)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
@@ -87,9 +87,8 @@ class HingeConfig(Model):
 
 
 class RegionConfig(Model):
-    """A circle on the sheet whose cells are treated in their own way."""
+    """A circle whose cells are not cut, from the middle of the cells' box."""
 
-    kind: Literal["passive", "monostable"]
     x_mm: float
     y_mm: float
     radius_mm: Positive
@@ -144,7 +143,7 @@ class SpecConfig(Model):
     selection: SelectionConfig = SelectionConfig()
     placement: Placement = "optimised"
     hinge: HingeConfig = HingeConfig()
-    regions: tuple[RegionConfig, ...] = ()
+    passive: tuple[RegionConfig, ...] = ()
     border: BorderConfig = BorderConfig()
     tool: ToolConfig = ToolConfig()
     bed_mm: tuple[Positive, Positive] | None = None
@@ -167,7 +166,7 @@ class SpecConfig(Model):
             selection=SelectionOptions(**self.selection.model_dump()),
             placement=self.placement,
             hinge=HingeOptions(self.hinge.rule, hinge, self.hinge.added_mm),
-            regions=tuple(Region(**region.model_dump()) for region in self.regions),
+            passive=tuple(Region(**region.model_dump()) for region in self.passive),
             border=BorderOptions(**self.border.model_dump()),
             tool=ToolOptions(kerf_mm=self.tool.kerf_mm or kerf_mm, **tool),
             spread_mm=self.tool.spread_mm,
