@@ -43,7 +43,11 @@ def _growth(timed: dict[int, list[Figure]]) -> list[Figure]:
     """Return the power of the vertex count that the time grows with, from the smallest mesh to the largest."""
     least, most = (timed[size][0] for size in (min(timed), max(timed)))
     power = float(np.log(most.value / least.value) / np.log(most.n / least.n))
-    return [Figure("time grows with this power of the vertices", power, "", "near linear", power < 1.3, most.n)]
+    return [
+        Figure(
+            "time grows with this power of the vertices", power, "", "near linear (taken as < 1.3)", power < 1.3, most.n
+        )
+    ]
 
 
 def targets_folder() -> Path | None:

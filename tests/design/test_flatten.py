@@ -203,3 +203,11 @@ def test_a_flipped_face_is_counted_and_an_anisotropic_stretch_measured() -> None
     np.testing.assert_array_equal(distortion(mesh, flat_mm, mesh.faces).flipped, flipped)
     codes = {finding.code for finding in check_flat(mesh, flat_mm, mesh.faces, boundary_loops(mesh))}
     assert "FLAT-FLIPPED" in codes
+
+
+def test_the_optional_solver_gives_the_same_flat(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pypardiso", reason="the extra `pardiso` is not installed")
+    mesh = freeform(edge_mm=6)
+    usual = flatten(mesh)
+    monkeypatch.setattr("design.flatten.laplace.PARDISO_FROM", 0)
+    np.testing.assert_allclose(flatten(mesh).flat_mm, usual.flat_mm, atol=1e-8)
