@@ -17,8 +17,13 @@ from benchmarks._published import SHEET_OFFSET_MM, PublishedMap, flat, half_map,
 from design.cells.library import CellLibrary, load_library
 from design.cells.select import SelectionOptions, on_curve, select, selection_curve
 from design.pattern.assign import averaged
+from design.pattern.paths import LAYERS, LayerPreset
 from design.pattern.slits import slits_of
 from design.pattern.tiling import tile
+from design.pattern.tubes import period_mm, seam_gap_mm
+from design.pipeline import build
+from design.spec import DesignSpec
+from design.targets import vase
 
 ROOT = Path(__file__).resolve().parents[1]
 STEP_RATIO = 0.002
@@ -121,6 +126,16 @@ def published_figures(shared: Path) -> list[Figure]:
     ]
 
 
+def vase_figures() -> list[Figure]:
+    """Return how well the two sides of a whole vase's sheet meet."""
+    presets = {layer: LayerPreset(0.5, 20.0) for layer in LAYERS}
+    made = build(DesignSpec("vase", response=None), vase(), load_library(), presets)
+    period = period_mm(made.flattening)
+    assert period is not None
+    gap, count = seam_gap_mm(made.cells.tiling, period), len(made.cells.kind)
+    return [Figure("whole vase: seam gap after the translation", gap, "mm", "<= 0.01 mm", gap <= 0.01, count)]
+
+
 def many_cells_figures() -> list[Figure]:
     """Return time and memory of a design of 20,000 cells in a process of its own, the kernels compiled before."""
     done = subprocess.run([sys.executable, "-c", MANY_CELLS], capture_output=True, text=True, cwd=ROOT, check=True)
@@ -139,4 +154,4 @@ def measure(words: list[str]) -> list[Figure]:
     figures = selection_figures("own map", load_library())
     if shared.is_dir():
         figures += selection_figures("published half map", half_map(shared)) + published_figures(shared)
-    return figures + many_cells_figures()
+    return figures + vase_figures() + many_cells_figures()

@@ -23,6 +23,7 @@ from design.pattern.drawing import Drawing
 from design.pattern.paths import Layer, LayerPreset
 from design.pattern.slits import hinge_widths_mm, outline_loops, slit_paths, slits_of
 from design.pattern.tiling import Array, Place, Tiling, best_place, tile
+from design.pattern.tubes import period_mm, tile_tube
 from design.predicted import Predicted, predict
 from design.spec import DesignSpec
 from design.surface import TriMesh
@@ -159,6 +160,8 @@ def scaled(
     if first[1] / first[0] > high / low:
         raise OutOfLibrary(*first, (low, high), found)
     flat = flat.scaled(1 / factor(*first, room, spec.scale))
+    if period_mm(flat) is not None:
+        return scaled_tube(spec, flat, (low, high), found)
     place = Place()
     if spec.placement == "optimised":
         place, misfit = best_place(flat.flat_mm, flat.faces, spec.cell_mm)
@@ -179,6 +182,27 @@ def scaled(
         raise OutOfLibrary(float(wanted.min()), float(wanted.max()), (low, high), found)
     _, flat, tiling, wanted = min(fits, key=lambda fit: fit[0])
     return flat, tiling.compact(), wanted
+
+
+def scaled_tube(
+    spec: DesignSpec, flat: Flattening, limits_ratio: tuple[float, float], found: list[Finding]
+) -> tuple[Flattening, Tiling, Array]:
+    """Return a tube's flat at the scale nearest to the wanted end at which a whole number of cells goes around."""
+    low, high = limits_ratio
+    fitting = []
+    for count, scale in flat.whole_cell_scales(spec.cell_mm, 0.8, 1.25):
+        scaled_flat = flat.scaled(scale)
+        tiling = tile_tube(scaled_flat, spec.cell_mm)
+        points, faces, copy = scaled_flat.unrolled()
+        area_ratio = scaled_flat.expansion_ratio[copy] ** 2
+        wanted = averaged(tiling, points, faces, area_ratio, spec.averaging)
+        if low <= wanted.min() and wanted.max() <= high:
+            fitting.append((abs(np.log(scale)), count, scaled_flat, tiling, wanted))
+    if not fitting:
+        raise OutOfLibrary(*_faces_range(flat), limits_ratio, found)
+    _, count, flat, tiling, wanted = min(fitting, key=lambda item: item[0])
+    found.append(Finding("TUBE-CELLS", f"{count} cells go around; the seam joins cell to cell", "info"))
+    return flat, tiling, wanted
 
 
 def _faces_range(flat: Flattening) -> tuple[float, float]:
@@ -211,8 +235,9 @@ def sheet_findings(spec: DesignSpec, drawing: Drawing, flat: Flattening) -> list
         found.append(
             Finding("SHEET-BED", text, "warning", hint="take smaller cells, the high end of expansions, cones")
         )
-    if flat.seams:
-        text = f"the flat has {len(flat.seams)} seam(s); cells do not run on across them"
+    open_seams = [seam for seam in flat.seams if not seam.closes_tube]
+    if open_seams:
+        text = f"the flat has {len(open_seams)} seam(s) to cones; cells do not run on across them"
         found.append(Finding("SEAM-OPEN", text, "warning", hint="join the seam's two sides by hand"))
     return found
 

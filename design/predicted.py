@@ -13,7 +13,7 @@ from design.cells.bending_map import load_bending
 from design.cells.library import CellLibrary
 from design.cells.select import Choice
 from design.deploy.indentation import Response, indentation_response
-from design.deploy.levels import Layout, sheet_layout
+from design.deploy.levels import Layout, sheet_layout, weld
 from design.deploy.predict import Deployed, deploy
 from design.findings import Finding
 from design.flatten import Flattening
@@ -42,8 +42,12 @@ def predict(
     watch: Callable[[str, float], None],
 ) -> Predicted:
     """Return what the shell model says of the cells on their sheet. Raises `NotConverged` where it finds no shape."""
-    layout = layout_of(tiling, choice, cut, library)
-    deployed = deploy(layout, flat.mesh, lifted(flat, tiling.vertices_mm))
+    layout, design_mm = layout_of(tiling, choice, cut, library), lifted(flat, tiling.vertices_mm)
+    if tiling.twins is not None:
+        right = np.flatnonzero(tiling.twins != np.arange(len(tiling.twins)))
+        layout = weld(layout, np.column_stack([tiling.twins[right], right]))
+        design_mm = np.delete(design_mm, right, axis=0)
+    deployed = deploy(layout, flat.mesh, design_mm)
     watch("pressing the indenter", 0.8)
     response = indentation_response(
         layout,
@@ -101,7 +105,8 @@ def _nearest_nu(choice: Choice, library: CellLibrary) -> Array:
 
 def lifted(flat: Flattening, points_mm: Array) -> Array:
     """Return where points of the flat lie on the target, `(n, 3)`; beyond its border the nearest face goes on."""
-    corners = flat.flat_mm[flat.faces]
+    points, faces, copy = flat.unrolled()
+    corners = points[faces]
     tree = shapely.STRtree(np.asarray(shapely.polygons(corners)))
     which, face = tree.query_nearest(np.asarray(shapely.points(points_mm)), all_matches=False)
     face = face[np.argsort(which)]
@@ -111,4 +116,4 @@ def lifted(flat: Flattening, points_mm: Array) -> Array:
     second = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
     third = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
     weights = np.column_stack([1 - second - third, second, third])
-    return np.asarray(np.einsum("nk,nkd->nd", weights, flat.mesh.vertices_mm[flat.mesh.faces[face]]))
+    return np.asarray(np.einsum("nk,nkd->nd", weights, flat.mesh.vertices_mm[flat.mesh.faces[copy[face]]]))
