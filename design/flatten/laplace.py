@@ -89,7 +89,7 @@ class _Pardiso:
 
 def _pardiso(A: csc_array) -> _Pardiso | None:
     try:
-        from pypardiso import PyPardisoError, PyPardisoSolver
+        from pypardiso.pardiso_wrapper import PyPardisoError, PyPardisoSolver
     except ImportError:  # the optional extra `pardiso`
         return None
     solver = PyPardisoSolver(mtype=2)  # symmetric positive definite, given by its upper triangle

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from design.errors import FlattenError
 from design.flatten import FlattenOptions, flatten
+from design.flatten.laplace import _Pardiso, assemble, factored
 from design.flatten.quality import check_flat, crossings, distortion, signed_areas_mm2
 from design.meshfiles import read_corner_uv, read_mesh
 from design.surface import TriMesh, boundary_loops, tidy
@@ -210,4 +211,6 @@ def test_the_optional_solver_gives_the_same_flat(monkeypatch: pytest.MonkeyPatch
     mesh = freeform(edge_mm=6)
     usual = flatten(mesh)
     monkeypatch.setattr("design.flatten.laplace.PARDISO_FROM", 0)
+    (rim,) = boundary_loops(mesh)
+    assert isinstance(factored(assemble(mesh), rim).factor, _Pardiso)
     np.testing.assert_allclose(flatten(mesh).flat_mm, usual.flat_mm, atol=1e-8)
