@@ -35,7 +35,7 @@ def tile_tube(flat: Flattening, edge_mm: float) -> Tiling:
     x = whole.centres_mm()[:, 0]
     tiling = whole.part((x >= start) & (x < start + period)).compact()
     gap, left = cKDTree(tiling.vertices_mm).query(tiling.vertices_mm - [period, 0.0])
-    twins = np.where(gap < SAME_MM * edge_mm, left, np.arange(len(gap)))
+    twins = np.where(gap < SAME_MM * edge_mm, left, np.arange(len(tiling.vertices_mm)))
     return replace(tiling, twins=np.asarray(twins, dtype=np.int64))
 
 
