@@ -90,9 +90,10 @@ class _Pardiso:
 def _pardiso(A: csc_array) -> _Pardiso | None:
     try:
         from pypardiso.pardiso_wrapper import PyPardisoError, PyPardisoSolver
-    except ImportError:  # the optional extra `pardiso`
+
+        solver = PyPardisoSolver(mtype=2)  # symmetric positive definite, given by its upper triangle
+    except ImportError:  # the optional extra `pardiso` or the library under it is not there
         return None
-    solver = PyPardisoSolver(mtype=2)  # symmetric positive definite, given by its upper triangle
     upper = csr_array(triu(A, format="csr"))
     try:
         solver.factorize(upper)
