@@ -68,7 +68,7 @@ def nine_bytes(count: int) -> list[str]:
     return [
         "G21G90",
         "G1F1000",
-        *(f"X{k % 90 + 10}Y{k % 70 + 10:02d}" + ("." if k % 3 else ".5") for k in range(count)),
+        *(f"X{k % 90 + 10}.5Y{k % 70 + 10}" + (".5" if k % 20 < 3 else "") for k in range(count)),
     ]
 
 
