@@ -102,7 +102,7 @@ def measure(image: NDArray[np.uint8], source: str, coupon: Coupon, gamma: str = 
         for power in powers_of(coupon)
     }
     bare, opened = np.median(np.array(levels), axis=0)
-    rim = float(abs(bare - scene.charred) / abs(opened - bare))
+    rim = float(abs(bare - scene.charred_frac) / abs(opened - bare))
     found += [_rim_finding(rim, source)] if rim > MOST_RIM_RATIO else _doubts(widths, squares, source)
     return KerfMeasurement(widths, squares, mm_per_px, rim, tuple(found))
 
@@ -115,7 +115,7 @@ class _Scene:
     to_pixels: ToPixels
     mm_per_px: float
     open_field: F64  # (6,) coefficients of `_terms`
-    charred: float
+    charred_frac: float
 
     def open_light(self, place_mm: F64) -> float:
         """Return the light of an open place at a point (2,)."""
@@ -213,7 +213,9 @@ def _slit_mm(scene: _Scene, slit: Slit) -> tuple[float, float]:
     inner = np.abs(rows.offset_mm) < INNER_MM
     bare = float(background.mean())
     mean = -lacking.mean(axis=0)[inner]
-    return plain, _two_boxes(rows.offset_mm[inner], mean, open_light - scene.charred, scene.charred - bare, plain)
+    return plain, _two_boxes(
+        rows.offset_mm[inner], mean, open_light - scene.charred_frac, scene.charred_frac - bare, plain
+    )
 
 
 def _two_boxes(offset: F64, light: F64, opened: float, charred: float, start_mm: float) -> float:

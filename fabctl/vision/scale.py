@@ -30,8 +30,8 @@ MOST_RAY_RATIO = 0.01  # distance of a ray from its point, over the distance to 
 class Bar:
     """Two points of the scan, in its own unit, whose distance is `length_mm`."""
 
-    first: tuple[float, float, float]
-    second: tuple[float, float, float]
+    first: F64  # (3,)
+    second: F64  # (3,)
     length_mm: float
 
 

@@ -78,13 +78,16 @@ def test_two_marks_are_too_few_and_four_that_contradict_are_refused() -> None:
 
 
 def test_bars_give_the_scale_and_contradicting_bars_are_refused() -> None:
-    bars = [Bar((0, 0, 0), (2, 0, 0), 50.0), Bar((0, 0, 0), (0, 4.001, 0), 100.0)]
+    bars = [
+        Bar(np.array([0, 0, 0]), np.array([2, 0, 0]), 50.0),
+        Bar(np.array([0, 0, 0]), np.array([0, 4.001, 0]), 100.0),
+    ]
     assert scale_by_bars(bars).mm_per_unit_ratio == pytest.approx(25.0, rel=3e-4)
     assert [f.code for f in scale_by_bars(bars[:1]).findings] == ["SCALE-ONE-BAR"]
     with pytest.raises(RefusedError, match="differ by"):
-        scale_by_bars([bars[0], Bar((0, 0, 0), (0, 4.1, 0), 100.0)])
+        scale_by_bars([bars[0], Bar(np.array([0, 0, 0]), np.array([0, 4.1, 0]), 100.0)])
     with pytest.raises(RefusedError, match="two different points"):
-        scale_by_bars([Bar((0, 0, 0), (0, 0, 0), 10.0)])
+        scale_by_bars([Bar(np.array([0, 0, 0]), np.array([0, 0, 0]), 10.0)])
 
 
 def test_rays_that_hardly_differ_or_do_not_meet_place_nothing() -> None:
