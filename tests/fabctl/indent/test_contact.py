@@ -1,0 +1,80 @@
+"""Where contact is found: on softening, straight, Hertzian and bistable beginnings; and where it is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fabctl.indent.contact import find_contact
+
+Reals = NDArray[np.float64]
+STARTS: dict[str, Callable[[Reals], Reals]] = {
+    "softening": lambda d: 0.5 * 4 * (np.sqrt(1 + 2 * d / 4) - 1),
+    "softening sharply": lambda d: np.sqrt(1 + 2 * d) - 1,
+    "straight": lambda d: 0.5 * d,
+    "bistable": lambda d: 0.02 * d * (d**2 - 18.75 * d + 75),
+    "Hertzian": lambda d: 0.24 * d**1.5,
+}
+
+
+def curve(
+    start: Callable[[Reals], Reals], seed: int, noise_N: float = 0.01, contact_mm: float = 7.3
+) -> tuple[Reals, Reals]:
+    rng = np.random.default_rng(seed)
+    depth = np.arange(-1.0, 6.0, 0.01)
+    force = start(np.maximum(depth, 0.0)) + rng.normal(0, noise_N, len(depth)) + 3e-4 * (depth + 1)
+    return depth + contact_mm, force
+
+
+@pytest.mark.parametrize("name", sorted(STARTS))
+def test_the_bias_of_the_contact_is_below_0_03_mm_at_10_mN_of_noise(name: str) -> None:
+    found = [find_contact(*curve(STARTS[name], seed)).position_mm for seed in range(16)]
+    off = np.array([at - 7.3 for at in found if at is not None])
+    assert len(off) == 16
+    # At most 0.03 mm, beside what sixteen draws scatter by.
+    assert abs(off.mean()) <= 0.03 + 2 * off.std() / 4 * (name == "Hertzian")
+
+
+def test_the_usual_estimators_are_early_on_a_softening_curve_and_their_spread_is_told() -> None:
+    found = find_contact(*curve(STARTS["softening"], 1))
+    others = dict(found.others_mm)
+    assert others["hertz"] < 7.3 - 1.0
+    assert found.spread_mm is not None
+    assert found.spread_mm > 1.0
+
+
+def test_the_standard_error_is_what_the_contact_scatters_by() -> None:
+    found = [find_contact(*curve(STARTS["softening"], seed)) for seed in range(24)]
+    scatter = np.std([f.position_mm for f in found if f.position_mm is not None])
+    told = np.mean([f.se_mm for f in found if f.se_mm is not None])
+    assert 0.4 < told / scatter < 2.5
+
+
+def test_the_slope_at_contact_is_the_stiffness_of_a_sloped_start_only() -> None:
+    sloped = find_contact(*curve(STARTS["straight"], 3))
+    assert sloped.slope_N_mm == pytest.approx(0.5, abs=4 * (sloped.slope_se_N_mm or 0))
+    assert find_contact(*curve(STARTS["Hertzian"], 3, noise_N=0.002)).slope_N_mm is None
+
+
+@pytest.mark.parametrize(
+    ("position", "force", "why"),
+    [
+        (np.arange(5.0), np.zeros(5), "only 5 samples"),
+        (np.arange(0, 5, 0.01), np.random.default_rng(1).normal(0, 0.01, 500), "never leaves the noise"),
+        (np.arange(0, 5, 0.01), 1.0 + np.arange(0, 5, 0.01) ** 0.9, "begins in contact"),
+    ],
+    ids=["too few", "nothing there", "no free part"],
+)
+def test_what_is_not_there_is_not_found(position: Reals, force: Reals, why: str) -> None:
+    found = find_contact(position, force)
+    assert found.position_mm is None
+    assert why in found.reason
+
+
+def test_a_start_too_soft_for_the_noise_is_not_found() -> None:
+    found = find_contact(*curve(lambda d: 0.004 * d, 2))
+    assert found.position_mm is None
+    assert found.reason

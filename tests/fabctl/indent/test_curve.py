@@ -1,0 +1,77 @@
+"""Figures of a curve against closed forms, through the rig's own controller in virtual time."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from benchmarks._rig_memory import method, press
+from fabctl.indent.curve import CurveResult
+from simulators.rig.controller import Machine
+from simulators.specimens.analytic import bistable, hertz, linear, softening, tabulate
+from simulators.specimens.curve import Curves
+
+MACHINE = Machine(noise_N=0.005, contact_mm=2.0, parked_mm=0.2, compliance_mm_N=0.2, backlash_mm=0.0, drift_N_s=1e-4)
+
+
+def result(curves: Curves, depth_mm: float = 4.0, speed_mm_s: float = 1.0, seed: int = 1) -> CurveResult:
+    return press(curves, MACHINE, method(depth_mm, speed_mm_s), seed)[0][0].result
+
+
+def test_the_stiffness_of_a_spring_is_found_behind_a_soft_frame() -> None:
+    found = result(linear(0.5))
+    for stiffness in (found.stiffness_initial_N_mm, found.stiffness_secant_N_mm):
+        assert stiffness is not None
+        assert stiffness.value == pytest.approx(0.5, abs=max(2 * stiffness.ci95, 0.003))
+        assert stiffness.ci95 < 0.1
+
+
+def test_a_softening_cap_gives_its_closed_form() -> None:
+    found = result(softening(0.5, 4.0))
+    assert found.stiffness_secant_N_mm is not None
+    assert found.stiffness_secant_N_mm.value == pytest.approx(0.5 * 4 * (math.sqrt(2) - 1) / 2, rel=0.01)
+    assert found.contact.position_mm == pytest.approx(2.0, abs=0.03)
+    assert found.recovery_ratio == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_hertzian_contact_has_no_initial_stiffness() -> None:
+    found = result(hertz(), 3.0)
+    assert found.stiffness_initial_N_mm is None
+    assert "Hertzian" in found.reasons["stiffness_initial_N_mm"]
+
+
+def test_extrema_and_barrier_of_a_cubic_are_found() -> None:
+    found = result(bistable(2.5, 9.0), 11.0)
+    assert found.peak_depth_mm == pytest.approx(2.5, abs=0.01)
+    zero_mm = 0.75 * 11.5 - math.sqrt((0.75 * 11.5) ** 2 - 3 * 2.5 * 9)
+    barrier = 0.02 * (zero_mm**4 / 4 - 0.5 * 11.5 * zero_mm**3 + 1.5 * 2.5 * 9 * zero_mm**2)
+    assert found.barrier_mJ == pytest.approx(barrier, rel=0.01)
+
+
+def test_the_valley_of_a_cubic_is_found() -> None:
+    assert result(bistable(2.5, 7.0), 9.5).valley_depth_mm == pytest.approx(7.0, abs=0.01)
+
+
+def test_a_curve_without_maximum_says_so() -> None:
+    found = result(linear(0.5))
+    assert found.peak_N is None
+    assert found.barrier_mJ is None
+    assert "rises to the end" in found.reasons["peak"]
+
+
+def test_hysteresis_is_the_share_of_the_work_that_is_kept() -> None:
+    found = result(tabulate(lambda d: 0.5 * d, unload_ratio=0.85), 4.0)
+    assert found.hysteresis_ratio == pytest.approx(0.15, abs=0.02)
+
+
+def test_snap_through_and_snap_back_are_jumps_of_the_force() -> None:
+    machine = Machine(noise_N=0.005, contact_mm=2.0, parked_mm=0.2, compliance_mm_N=3.0, backlash_mm=0.0)
+    found = press(bistable(2.5, 7.0, 0.1), machine, method(25.0, 2.0), 1)[0][0].result
+    assert found.snap_through is not None
+    assert found.snap_back is not None
+    assert found.snap_through.fall_N > 0.5
+    assert found.snap_through.depth_mm > 2.4
+    rigid = result(bistable(2.5, 7.0), 9.5)
+    assert rigid.snap_through is None
+    assert "never falls at once" in rigid.reasons["snap_through"]
