@@ -111,7 +111,7 @@ class Grid(Model):
     x_mm: Annotated[tuple[float, ...], Field(min_length=1)]
     y_mm: Annotated[tuple[float, ...], Field(min_length=1)]
     speed_mm_s: Positive = 10.0
-    steps: Annotated[tuple[Simple, ...], Field(min_length=1)]
+    steps: tuple[Simple, ...]
 
 
 Step = Annotated[
@@ -139,7 +139,14 @@ class MethodConfig(Model):
     acceleration_mm_s2: Annotated[float, Field(gt=0, le=500)] = 50.0
     secant_mm: Positive = 2.0
     limits: LimitsConfig
-    steps: Annotated[tuple[Step, ...], Field(min_length=1)]
+    steps: tuple[Step, ...]
+
+    @model_validator(mode="after")
+    def _does_something(self) -> MethodConfig:
+        # Not a field's minimum: pydantic would add that complaint wherever one of the steps is wrong.
+        if not self.steps or any(isinstance(step, Grid) and not step.steps for step in self.steps):
+            raise ValueError("give at least one step")
+        return self
 
 
 def load_method(name: str, home: Path) -> MethodConfig:

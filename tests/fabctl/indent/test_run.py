@@ -1,0 +1,163 @@
+"""A run in virtual time: what is asked of the controller, and how every way out leaves the stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from benchmarks._rig_memory import REGISTERS, Kept, MemoryBus, method
+from drivers.errors import DeviceTimeout
+from drivers.rig.indenter import Indenter, RigFaulted
+from fabctl.config.method import MethodConfig
+from fabctl.errors import Stopped
+from fabctl.events import Event
+from fabctl.indent.method import actions
+from fabctl.indent.run import ForceOffZero, NoContact, Runner, Wish
+from simulators.rig import registers as R
+from simulators.rig.controller import Controller, Machine
+from simulators.specimens.analytic import linear, softening
+from simulators.specimens.curve import Curves, Specimen
+
+QUIET = Machine(noise_N=0.001, contact_mm=2.0, parked_mm=0.2, backlash_mm=0.0)
+
+
+class Bench:
+    """A controller, a runner on it, and what was heard."""
+
+    def __init__(
+        self,
+        curves: Curves | None,
+        plan: MethodConfig,
+        machine: Machine = QUIET,
+        wish: Callable[[Bench], Wish] = lambda _: "go",
+    ) -> None:
+        self.device = Controller(machine, Specimen(curves) if curves else None)
+        self.told: list[tuple[str, dict[str, object]]] = []
+        self.device.tell = lambda kind, facts: self.told.append((kind, facts))
+        self.bus, self.kept, self.events = MemoryBus(self.device), Kept(), list[Event]()
+        self.rig = Indenter(self.bus, REGISTERS, now_s=self.bus.now_s, sleep=self.bus.sleep)
+        self.runner = Runner(
+            self.rig,
+            plan,
+            actions(plan),
+            self.kept,
+            self.bus,
+            100.0,
+            self.events.append,
+            lambda: wish(self),
+            beside=lambda work, _: work(),
+        )
+
+    def codes(self) -> list[int]:
+        return [int(facts["code"]) for kind, facts in self.told if kind == "command"]  # type: ignore[call-overload]
+
+
+def left_standing(bench: Bench) -> bool:
+    """Tell whether the stage stands disarmed, and does not move in the second that follows."""
+    at = bench.device.axis.position_mm
+    bench.device.advance(1000)
+    state = R.values_of(R.STATUS, bench.device.status_words()[:-1])["state"]
+    return state in (R.DISARMED, R.FAULTED) and abs(bench.device.axis.position_mm - at) < 0.05
+
+
+def test_a_normal_end_draws_back_and_disarms() -> None:
+    bench = Bench(linear(0.5), method(3.0, 2.0))
+    ending = bench.runner.execute()
+    assert ending.curves_done == [(0, 1)]
+    assert bench.device.axis.position_mm == pytest.approx(0.2, abs=1e-3)
+    assert left_standing(bench)
+    assert bench.codes()[-2:] == [R.STOP, R.DISARM]
+
+
+def test_limits_are_in_the_controller_before_the_first_motion() -> None:
+    bench = Bench(linear(0.5), method(3.0, 2.0))
+    bench.runner.execute()
+    assert bench.device.settings["force_max"] == pytest.approx(45.0)
+    assert bench.device.settings["travel_max"] == pytest.approx(55.0)
+    assert bench.codes().index(R.ARM) < bench.codes().index(R.HOME)
+
+
+def test_a_stop_leaves_the_stage_where_it_is() -> None:
+    bench = Bench(linear(0.5), method(5.0, 1.0), wish=lambda b: "stop" if b.device.depth_mm > 1.0 else "go")
+    with pytest.raises(Stopped):
+        bench.runner.execute()
+    assert left_standing(bench)
+    assert bench.device.depth_mm == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_pause_stands_and_goes_on_to_the_same_place() -> None:
+    paused_ticks: list[int] = []
+
+    def wish(bench: Bench) -> Wish:
+        if bench.device.depth_mm > 1.0 and len(paused_ticks) < 50:
+            paused_ticks.append(bench.device.tick_count)
+            return "pause"
+        return "go"
+
+    bench = Bench(linear(0.5), method(3.0, 1.0), wish=wish)
+    ending = bench.runner.execute()
+    assert ending.curves_done == [(0, 1)]
+    assert paused_ticks[-1] - paused_ticks[0] > 200
+    deepest = max(row.position_mm for row in bench.kept.rows)
+    assert deepest == pytest.approx(2.0 + 3.0, abs=0.2)  # contact is taken where the trigger is met
+
+
+def test_an_overload_stops_and_is_not_drawn_back() -> None:
+    plan = method(8.0, 2.0)
+    plan = plan.model_copy(update={"limits": plan.limits.model_copy(update={"force_N": 2.0})})
+    bench = Bench(linear(0.5), plan)
+    with pytest.raises(RigFaulted, match="overload"):
+        bench.runner.execute()
+    assert left_standing(bench)
+    assert bench.device.true_N == pytest.approx(2.0, abs=0.15)
+
+
+def test_no_specimen_is_no_contact() -> None:
+    bench = Bench(None, method(3.0, 2.0))
+    with pytest.raises(NoContact, match="did not rise"):
+        bench.runner.execute()
+    assert left_standing(bench)
+
+
+def test_a_cell_far_off_zero_is_refused_before_the_approach() -> None:
+    bench = Bench(linear(0.5), method(3.0, 2.0), replace(QUIET, zero_N=30.0))
+    with pytest.raises(ForceOffZero):
+        bench.runner.execute()
+    assert bench.device.depth_mm < 0
+
+
+def test_a_line_that_falls_silent_ends_the_run_within_the_watchdog() -> None:
+    bench = Bench(linear(0.5), method(8.0, 1.0))
+    plain = bench.bus.exchange
+    silent_since: list[float] = []
+
+    def exchange(read_address: int, count: int, write_address: int, values: list[int]) -> list[int]:
+        if bench.device.depth_mm > 1.0:
+            silent_since.append(bench.bus.now_s())
+            bench.device.advance(100)
+            raise DeviceTimeout("memory:", "exchange", 0.1)
+        return plain(read_address, count, write_address, values)
+
+    bench.bus.exchange = exchange  # type: ignore[method-assign, assignment]
+    with pytest.raises(DeviceTimeout):
+        bench.runner.execute()
+    fault = next(facts for kind, facts in bench.told if kind == "fault")
+    assert fault["bit"] == R.WATCHDOG
+    assert left_standing(bench)
+
+
+def test_a_soft_specimen_is_approached_to_where_it_is_first_touched() -> None:
+    plan = method(3.0, 1.0, trigger_N=0.02)
+    bench = Bench(softening(0.01, 3.0), plan, replace(QUIET, noise_N=0.0003))
+    ending = bench.runner.execute()
+    # The trigger is met some 3 mm deep.
+    assert ending.contacts_mm[0] == pytest.approx(2.0, abs=0.2)
+
+
+def test_only_fresh_samples_feed_the_watchdog() -> None:
+    bench = Bench(linear(0.5), method(3.0, 1.0))
+    bench.runner.execute()
+    fed = bench.device.last_feed
+    assert fed in {row.sequence for row in bench.kept.rows}
