@@ -114,5 +114,5 @@ def press(
     device = Controller(machine, Specimen(curves), seed=seed)
     bus, kept = MemoryBus(device), Kept()
     rig = Indenter(bus, REGISTERS, now_s=bus.now_s, sleep=bus.sleep)
-    Runner(rig, plan, actions(plan), kept, bus, sample_hz, beside=lambda work, _: work()).execute()
+    Runner(rig, plan, actions(plan), kept, bus, sample_hz).execute()
     return analyse(kept.samples(), machine.compliance_mm_N, 2.0, machine.gain_ratio), kept

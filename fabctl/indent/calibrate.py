@@ -84,7 +84,9 @@ def frame_method(rig: RigConfig, force_N: float) -> MethodConfig:
     return MethodConfig(
         name="frame",
         description="Press a rigid block: what gives way is the frame",
-        limits=LimitsConfig(force_N=min(rig.force_limit_N, 1.3 * force_N + 1.0), travel_mm=rig.travel_mm),
+        limits=LimitsConfig(
+            force_N=min(rig.force_limit_N, 1.3 * force_N + 1.0), travel_mm=rig.travel_mm, watchdog_s=1.0
+        ),
         steps=(
             Tare(step="tare", time_s=1.0),
             Approach(step="approach", speed_mm_s=0.5, trigger_N=0.1, clearance_mm=0.1),

@@ -28,6 +28,7 @@ AGREE_SIGMA = 1.5  # and where its contact lies outside so many standard errors 
 DRIFT_N_MM = 2e-3  # how much the free part is expected to slope: drift over speed
 WINDOWS = (0.15, 0.25, 0.4, 0.6, 0.85)  # of the way from the guess to the first maximum
 ENOUGH_COUNT, THIN_MM = 350, 0.02  # more samples than this are averaged over at most so much of the stroke
+TOUCH_COUNT, TOUCH_MM = 80, 0.1  # for the quick look during an approach
 SE_GOOD_MM = 0.05  # a shorter window this sure may end the search; a less sure one is lengthened in any case
 SE_MAX_MM = 0.25  # a contact less certain than this is not found
 
@@ -73,7 +74,7 @@ class Fit:
 
 def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
     """Return the contact on a loading curve; `position_mm` (n,) rises, the frame's give already taken off."""
-    u, f = _thinned(position_mm, force_N)
+    u, f = _thinned(position_mm, force_N, ENOUGH_COUNT, THIN_MM)
     guess = _guess(u, f)
     if isinstance(guess, str):
         return Contact(None, guess)
@@ -102,10 +103,23 @@ def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
     return found
 
 
-def _thinned(u: Reals, f: Reals) -> tuple[Reals, Reals]:
+def first_touch(position_mm: Reals, force_N: Reals) -> float | None:
+    """Return roughly where an approach met the specimen, or None.
+
+    Quick, some milliseconds: it is asked between two samples, while a watchdog waits for the next.
+    """
+    u, f = _thinned(position_mm, force_N, TOUCH_COUNT, TOUCH_MM)
+    guess = _guess(u, f)
+    if isinstance(guess, str):
+        return None
+    start, _, noise_N = guess
+    return _scan(u, f, float(u[start]), float(u[-1] - u[start]) + 1.0, 0.2, SLOPED, noise_N).contact_mm
+
+
+def _thinned(u: Reals, f: Reals, enough_count: int, most_mm: float) -> tuple[Reals, Reals]:
     """Return means of neighbouring samples where they lie closer than is of use; the fits cost by the sample."""
     spacing = float(np.median(np.abs(np.diff(u)))) if len(u) > 1 else 1.0
-    many = min(len(u) // ENOUGH_COUNT, int(THIN_MM / max(spacing, 1e-6)))
+    many = min(len(u) // enough_count, int(most_mm / max(spacing, 1e-6)))
     if many < 2:
         return u, f
     kept = len(u) // many * many

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -21,7 +20,7 @@ from fabctl.clock import Clock
 from fabctl.config.method import MethodConfig
 from fabctl.errors import FabctlError, Stopped
 from fabctl.events import Emit, Event, silent
-from fabctl.indent.contact import Contact, find_contact
+from fabctl.indent.contact import first_touch
 from fabctl.indent.method import Action, time_s
 from fabctl.indent.recorder import Row
 
@@ -69,15 +68,6 @@ class Ending:
     curves_done: list[tuple[int, int]] = field(default_factory=list)
 
 
-def in_a_thread(work: Callable[[], Contact], meanwhile: Callable[[], object]) -> Contact:
-    """Return what `work` returns, doing `meanwhile` again and again until it is there."""
-    with ThreadPoolExecutor(1) as pool:
-        job = pool.submit(work)
-        while not job.done():
-            meanwhile()
-        return job.result()
-
-
 class Runner:
     """Carries out actions one by one, sampling on fixed slots all the while."""
 
@@ -92,9 +82,7 @@ class Runner:
         emit: Emit = silent,
         wish: Callable[[], Wish] = lambda: "go",
         go_on: Callable[[str], bool] = lambda _message: True,
-        beside: Callable[[Callable[[], Contact], Callable[[], object]], Contact] = in_a_thread,
     ) -> None:
-        self.beside = beside
         self.rig, self.method, self.plan, self.recorder = rig, method, plan, recorder
         self.clock, self.emit, self.wish, self.go_on = clock, emit, wish, go_on
         self.slot_s = 1.0 / sample_hz
@@ -219,8 +207,10 @@ class Runner:
         position = np.array([place for place, _ in self._trace])
         force = np.array([force for _, force in self._trace])
         forward = np.flatnonzero(np.diff(position, prepend=position[:1] - 1.0) > 0)
-        # The watchdog is fed by sampling alone, so sampling goes on while the fit is computed.
-        found = self.beside(lambda: find_contact(position[forward], force[forward]), self._fresh).position_mm
+        # Nothing samples while this is computed, so nothing feeds the watchdog: the stage stands disarmed meanwhile.
+        self.rig.disarm()
+        found = first_touch(position[forward], force[forward])
+        self.rig.arm()
         return triggered_mm if found is None else min(found, triggered_mm)
 
     def _make_free(self, action: Action) -> None:

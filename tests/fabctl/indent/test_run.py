@@ -47,7 +47,6 @@ class Bench:
             100.0,
             self.events.append,
             lambda: wish(self),
-            beside=lambda work, _: work(),
         )
 
     def codes(self) -> list[int]:
