@@ -15,7 +15,7 @@ from fabctl.scan.target import Target
 
 Floats = NDArray[np.float64]
 
-KEEP_CLOUD_FRAC, KEEP_TARGET_FRAC = 0.97, 0.7  # the rest is held at its edge: outliers, and what was not seen
+KEEP_CLOUD_FRAC, KEEP_TARGET_FRAC = 0.92, 0.7  # the rest is held at its edge: outliers, and what was not seen
 EXPLAINED_FRAC = 0.025  # of the diagonal; a point nearer to the target than this is explained by the pose
 WORST_RMS_FRAC = 0.02
 LEAST_COVERAGE_FRAC, LEAST_EXPLAINED_FRAC = 0.45, 0.75

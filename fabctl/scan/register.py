@@ -169,10 +169,15 @@ def register(task: Task) -> Registration:
         return Registration("failed", None, (), None, none, task.symmetries, (finding,))
     body, found = min(fits, key=lambda t: (not t[1][0].plausible(), _merit(t[1][0])))
     if found[0].score_frac > MIRROR_DOUBT_FRAC or not found[0].plausible():
-        image, proper = _mirrored(task, body, found[0])
-        if image is not None and proper is None:
-            return _finished(task, "mirrored", image, (), body)
-        found = _distinct(task, [*found, proper]) if proper is not None else found
+        # Where no part fits as it is, the merit of their poses says nothing about which one is the specimen.
+        doubtful = [body] if found[0].plausible() else [b for b, _ in fits]
+        for other in doubtful:
+            image, proper = _mirrored(task, other, found[0])
+            if image is not None and proper is None:
+                return _finished(task, "mirrored", image, (), other)
+            if proper is not None:
+                body, found = other, _distinct(task, [*(found if other is body else ()), proper])
+                break
     if not found[0].plausible():
         return _finished(task, "failed", found[0], (), body)
     found = _distinct(task, [*found, *pushed(task, body, found[0])])
