@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -21,6 +21,7 @@ from design.pattern.assign import averaged, factor
 from design.pattern.border import framed
 from design.pattern.drawing import Drawing
 from design.pattern.paths import Layer, LayerPreset
+from design.pattern.seams import Pair, label_paths, seam_pairs
 from design.pattern.slits import hinge_widths_mm, outline_loops, slit_paths, slits_of
 from design.pattern.tiling import Array, Place, Tiling, best_place, tile
 from design.pattern.tubes import period_mm, tile_tube
@@ -92,8 +93,8 @@ def build(
     hinge = hinge_widths_mm(choice.expansion_ratio, spec.hinge)
     watch("drawing slits", 0.4)
     cells = Cells(tiling, wanted, choice, hinge, kinds_of(spec, tiling))
-    drawing, shift = draw(spec, cells, library.sheet)
-    found += sheet_findings(spec, drawing, placed)
+    drawing, shift, labelled = draw(spec, cells, library.sheet, placed)
+    found += sheet_findings(spec, drawing, placed, labelled)
     cells = replace(cells, tiling=tiling.moved(shift))
     placed = placed.moved_to(placed.flat_mm + shift)
     watch("ordering the cut", 0.5)
@@ -223,8 +224,8 @@ def kinds_of(spec: DesignSpec, tiling: Tiling) -> tuple[str, ...]:
     return tuple("passive" if stays else "cut" for stays in passive)
 
 
-def sheet_findings(spec: DesignSpec, drawing: Drawing, flat: Flattening) -> list[Finding]:
-    """Return what is doubtful about the sheet as it is drawn."""
+def sheet_findings(spec: DesignSpec, drawing: Drawing, flat: Flattening, labelled: Sequence[Pair]) -> list[Finding]:
+    """Return what is doubtful about the sheet as it is drawn, and which labels help to join it."""
     found = []
     if drawing.id_anchor is None and spec.border.id_height_mm > 0:
         found.append(Finding("ID-PLACE", "no lower edge has room for the tag: no id can be engraved", "warning"))
@@ -239,13 +240,20 @@ def sheet_findings(spec: DesignSpec, drawing: Drawing, flat: Flattening) -> list
     if open_seams:
         text = f"the flat has {len(open_seams)} seam(s) to cones; cells do not run on across them"
         found.append(Finding("SEAM-OPEN", text, "warning", hint="join the seam's two sides by hand"))
+    if flat.seams and labelled:
+        text = f"{len(labelled)} pairs of cells that meet are labelled, {labelled[0].label} to {labelled[-1].label}"
+        found.append(Finding("SEAM-LABELS", text, "info"))
+    elif flat.seams:
+        found.append(Finding("SEAM-LABELS", "no cell along the seams has room for a label", "warning"))
     return found
 
 
-def draw(spec: DesignSpec, cells: Cells, sheet: Sheet) -> tuple[Drawing, Array]:
-    """Return the drawing of the cells with everything around them, and by how much it moved them."""
+def draw(spec: DesignSpec, cells: Cells, sheet: Sheet, flat: Flattening) -> tuple[Drawing, Array, list[Pair]]:
+    """Return the drawing of the cells with everything around them, by how much it moved them, and the seams' labels."""
     tiling, choice, cut = cells.tiling, cells.choice, cells.cut()
     slits = slits_of(tiling, choice.t_mm, choice.theta_rad, cells.hinge_mm, sheet.slit_mm, cut)
     paths = slit_paths(tiling, slits, cut)
     mouths = np.array([path.points_mm[-1] for path in paths if path.opens]).reshape(-1, 2)
-    return framed(outline_loops(tiling), mouths, paths, spec.border, spec.cell_mm)
+    labels, labelled = label_paths(tiling, slits, cut, seam_pairs(tiling, flat))
+    drawing, shift = framed(outline_loops(tiling), mouths, paths + labels, spec.border, spec.cell_mm)
+    return drawing, shift, labelled
