@@ -26,6 +26,7 @@ from fabctl.vision.template import (
     render,
     sample_grid,
     warp,
+    worst_module,
 )
 
 Family = Literal["5x5_250", "mip_36h12"]
@@ -33,6 +34,7 @@ FAMILIES: dict[Family, str] = {"5x5_250": "DICT_5X5_250", "mip_36h12": "DICT_ARU
 ACCEPT_RATIO = 0.80  # correlation of the whole picture, frame and margin included
 MARGIN_RATIO = 0.06  # by how much the best code must beat the second
 CODE_RATIO = 0.55  # correlation of the code's modules alone, where frame and margin no longer help
+WRONG_MODULE = 0.6  # of what a module of the other colour would show; one such makes it another marker
 HOPELESS_RATIO = 0.6  # no change of blur brings a first fit below this to ACCEPT_RATIO
 SCREEN_RATIO = 0.45  # correlation with the bare frame that a quadrilateral needs to be looked at further
 BLURS_px = (0.5, 0.9, 1.4, 2.0, 3.0)
@@ -141,7 +143,7 @@ def _refined(grey: F64, H: F64, family: Family, k: int, blur_px: float, inverted
     found = _best_blur(grey, bits, turned / turned[2, 2], blur_px)
     if found is None or found.score_ratio < (-1 if inverted else ACCEPT_RATIO) or abs(found.score_ratio) < ACCEPT_RATIO:
         return None
-    if not _stands_out(grey, found, family, number):
+    if not _stands_out(grey, found, family, number) or worst_module(grey, bits, found) > WRONG_MODULE:
         return None
     px = module_px(found.H, len(bits))
     return Marker(family, number, found.H, abs(found.score_ratio), found.contrast_frac, found.blur_px, min(px))

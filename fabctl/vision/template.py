@@ -174,6 +174,24 @@ def _judge(H: F64, patch: F64, origin: F64, grid: F64, model: F64, fixed: F64, b
     return Fit(H / H[2, 2], score, float(levels[1]) / max(white, float(levels[0])), blur_px)
 
 
+def worst_module(image: F64, bits: F64, found: Fit) -> float:
+    """Return how wrong the marker's worst module is: 0 as it should be, 1 as if it were of the other colour.
+
+    What a wrong module would show, averaged over its own square, is what blur leaves of it along both axes.
+    """
+    modules, per_module = len(bits), 6
+    places = (np.arange(modules * per_module) + 0.5) / (modules * per_module) * 2 - 1
+    grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    sigma = math.hypot(found.blur_px, PIXEL_SIGMA_PX) / np.array(module_px(found.H, modules))
+    model = render(bits, places, (float(sigma[0]), float(sigma[1]))).ravel()
+    fixed = np.column_stack([np.ones(len(grid)), model, grid])
+    grey = look(image, warp(found.H, grid))
+    levels = _solve(fixed, grey)
+    rest = (grey - fixed @ levels).reshape(modules, per_module, modules, per_module).mean(axis=(1, 3)) / abs(levels[1])
+    left = [blur_matrix(places, modules, s)[:, modules // 2].reshape(modules, -1).mean(axis=1).max() for s in sigma]
+    return float(np.abs(rest).max() / (left[0] * left[1]))
+
+
 def correlation(a: F64, b: F64) -> float:
     """Return Pearson's correlation of two arrays; NaN where one is flat."""
     a, b = a - a.mean(), b - b.mean()

@@ -70,6 +70,20 @@ def test_a_mirrored_marker_is_no_marker_but_is_seen_in_a_mirror() -> None:
     assert [marker.id for marker in mirrored(turned)] == [17]
 
 
+def test_no_registration_mark_is_read_in_a_mirror_as_another() -> None:
+    turned = [np.ascontiguousarray(photograph(number, 6.0)[0][:, ::-1]) for number in REGISTRATION_IDS]
+    assert [marker.id for picture in turned for marker in find_markers(picture)] == []
+
+
+@pytest.mark.parametrize("family", [cv2.aruco.DICT_4X4_50, cv2.aruco.DICT_6X6_50, cv2.aruco.DICT_APRILTAG_36h11])
+def test_markers_of_another_family_are_left_alone(family: int) -> None:
+    page = np.full((150, 900), 215, np.uint8)
+    for k in range(6):
+        drawn = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(family), 4 * k, 96)
+        page[27:123, 27 + 145 * k : 123 + 145 * k] = drawn
+    assert find_markers(page) == []
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_textures_hold_no_marker(seed: int) -> None:
     rng = np.random.default_rng(seed)
