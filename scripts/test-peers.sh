@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Build what the rig driver is tested against: a rig on libmodbus, and mbpoll. Never fails: without them the tests that
-# need them are skipped, with the reason.
+# Install and build what the tests hold the tool against: a rig on libmodbus, mbpoll, and Chromium for the report's page.
+# Never fails: without them the tests that need them are skipped, with the reason.
 cd "$(dirname "$0")/.."
 out=build/peers
 mkdir -p "$out"
@@ -10,6 +10,8 @@ command -v cc >/dev/null || missing+=(gcc libc6-dev)
 [ -e /usr/include/modbus/modbus.h ] || missing+=(libmodbus-dev)
 command -v mbpoll >/dev/null || missing+=(mbpoll)
 command -v pkg-config >/dev/null || missing+=(pkg-config)
+
+[ -x /usr/bin/chromium ] || missing+=(chromium)
 
 if [ ${#missing[@]} -gt 0 ]; then
   install="apt-get install -y --no-install-recommends ${missing[*]}"

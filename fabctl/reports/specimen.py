@@ -20,7 +20,7 @@ from fabctl.workspace import Specimen, Workspace
 def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
     """Return the page about `specimen` from its records; what was not done is named as missing."""
     runs = lab.runs_of(specimen.name)
-    latest = {str(run.manifest()["kind"]): run for run in runs if status_of(run) != "running"}
+    latest = telling(runs)
     steps = [design_step(specimen.design)]
     steps += [cut_step(latest["cut"])] if "cut" in latest else []
     steps += [indent_step(latest["indent"], specimen.design)] if "indent" in latest else []
@@ -41,6 +41,19 @@ def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
         made_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         head=script() if "scan" in latest else "",
     )
+
+
+def telling(runs: Sequence[RunFolder]) -> dict[str, RunFolder]:
+    """Return the run that speaks for each kind: the latest that was done, else the latest there is.
+
+    A later attempt that failed takes nothing away from an earlier result; it stands in the provenance.
+    """
+    found: dict[str, RunFolder] = {}
+    for run in runs:  # oldest first
+        kind, status = str(run.manifest()["kind"]), status_of(run)
+        if status == "done" or (status != "running" and (kind not in found or status_of(found[kind]) != "done")):
+            found[kind] = run
+    return found
 
 
 def verdict(latest: dict[str, RunFolder]) -> tuple[Word, str, list[str]]:

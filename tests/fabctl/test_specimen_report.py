@@ -1,0 +1,86 @@
+"""A specimen's page says what is known, what is missing, and which run speaks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fabctl.records.folder import RunFolder, start_run
+from fabctl.reports.page import render
+from fabctl.reports.specimen import specimen_report, telling, verdict
+from fabctl.workspace import Specimen, Workspace
+
+SCAN: dict[str, Any] = {
+    "deviation": {"rms_mm": 0.5, "rms_frac": 0.0025},
+    "tolerance_frac": 0.01,
+    "share_within_required_frac": 0.95,
+    "verdict": "pass",
+}
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path)
+
+
+@pytest.fixture
+def specimen(lab: Workspace) -> Specimen:
+    (lab.root / "design").mkdir()
+    (lab.root / "design/cells.csv").write_text("cell,expansion_ratio,hinge_mm\n0,1.3,0.25\n1,1.5,0.25\n")
+    return lab.new_specimen(lab.root / "design")
+
+
+def run(lab: Workspace, kind: str, status: str, result: dict[str, Any] | None = None, message: str = "") -> RunFolder:
+    made = start_run(lab.runs, kind, specimen="S-0001")
+    made.path.rename(lab.runs / f"{len(list(lab.runs.iterdir())):03d}-{kind}-x")  # one second holds several
+    made = RunFolder(lab.runs / f"{len(list(lab.runs.iterdir())):03d}-{kind}-x")
+    if result is not None:
+        made.write_result(result)
+    made.finish(status, message)
+    return made
+
+
+def test_what_was_not_done_is_named(lab: Workspace, specimen: Specimen) -> None:
+    run(lab, "cut", "done", {})
+    report = specimen_report(lab, specimen)
+    assert report.word == "incomplete"
+    assert report.reasons == ("indent: not done yet", "scan: not done yet")
+    page = render(report)
+    assert "1.300 to 1.500" in page
+    assert "not done yet" in page
+
+
+def test_a_later_failure_takes_nothing_from_an_earlier_result(lab: Workspace, specimen: Specimen) -> None:
+    good = run(lab, "scan", "done", SCAN)
+    run(lab, "scan", "refused", None, "bin.obj: cannot be compared")
+    assert telling(lab.runs_of("S-0001"))["scan"] == good
+
+
+def test_a_newer_result_replaces_an_older_one(lab: Workspace, specimen: Specimen) -> None:
+    run(lab, "scan", "failed")
+    run(lab, "scan", "done", SCAN)
+    newest = run(lab, "scan", "done", SCAN | {"verdict": "fail"})
+    assert telling(lab.runs_of("S-0001"))["scan"] == newest
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({}, "pass"),
+        ({"verdict": "fail"}, "fail"),
+        ({"tolerance_frac": None}, "incomplete"),
+        ({"deviation": None}, "incomplete"),
+    ],
+)
+def test_the_verdict_follows_the_scan(lab: Workspace, specimen: Specimen, change: dict[str, Any], word: str) -> None:
+    for kind in ("cut", "indent"):
+        run(lab, kind, "done", {})
+    run(lab, "scan", "done", SCAN | change)
+    assert verdict(telling(lab.runs_of("S-0001")))[0] == word
+
+
+def test_text_from_outside_cannot_become_markup(lab: Workspace, specimen: Specimen) -> None:
+    run(lab, "cut", "failed", {}, "<script>alert(1)</script>")
+    assert "<script>alert" not in render(specimen_report(lab, specimen))
