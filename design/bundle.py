@@ -27,6 +27,7 @@ from design.errors import BundleError
 from design.export.dxf import dxf
 from design.export.svg import svg
 from design.findings import Finding
+from design.job import Job
 from design.meshfiles import write_ply
 from design.pattern.drawing import Drawing, as_json, from_json
 from design.pipeline import Design
@@ -54,9 +55,10 @@ class Bundle:
             raise BundleError(f"{self.path}: this design has no {name}")
         return self.path / name
 
-    def drawing(self) -> Drawing:
-        """Return what is to be cut."""
-        return from_json(json.loads(self.file("paths.json").read_text(encoding="utf-8")))
+    def drawing(self, sheet: int | None = None) -> Drawing:
+        """Return what is to be cut; of a design that is split over sheets, the whole or `sheet`, from 1."""
+        name = "paths.json" if sheet is None else f"paths-{sheet}.json"
+        return from_json(json.loads(self.file(name).read_text(encoding="utf-8")))
 
     def cells(self) -> list[dict[str, str]]:
         """Return the rows of `cells.csv`."""
@@ -126,12 +128,11 @@ def _write_files(design: Design, spec_text: str, folder: Path) -> None:
     texts = {
         "spec.yaml": spec_text,
         "cells.csv": cells_csv(design),
-        "paths.json": json.dumps(as_json(drawing), allow_nan=False) + "\n",
-        "cut.dxf": dxf(drawing.paths, drawing.size_mm),
-        "cut.svg": svg(drawing.paths, drawing.size_mm, design.spec.name),
-        "cut.nc": "\n".join(design.job.lines) + "\n",
+        **_cut_texts("", drawing, design.job, design.spec.name),
         "findings.json": json.dumps([finding.as_dict() for finding in design.findings], indent=1) + "\n",
     }
+    for k, one in enumerate(design.sheets, start=1):
+        texts |= _cut_texts(f"-{k}", one.drawing, one.job, f"{design.spec.name}, sheet {k}")
     if design.predicted is not None:
         texts["response.csv"] = response_csv(design.predicted.response)
         write_ply(folder / "deployed.ply", design.predicted.deployed.mesh)
@@ -141,6 +142,15 @@ def _write_files(design: Design, spec_text: str, folder: Path) -> None:
     write_ply(folder / "target.ply", design.mesh)
     write_ply(folder / "flat.ply", TriMesh(np.column_stack([flat.flat_mm, np.zeros(len(flat.flat_mm))]), flat.faces))
     (folder / "preview.png").write_bytes(preview_png(design))
+
+
+def _cut_texts(suffix: str, drawing: Drawing, job: Job, title: str) -> dict[str, str]:
+    return {
+        f"paths{suffix}.json": json.dumps(as_json(drawing), allow_nan=False) + "\n",
+        f"cut{suffix}.dxf": dxf(drawing.paths, drawing.size_mm),
+        f"cut{suffix}.svg": svg(drawing.paths, drawing.size_mm, title),
+        f"cut{suffix}.nc": "\n".join(job.lines) + "\n",
+    }
 
 
 def cells_csv(design: Design) -> str:
@@ -192,6 +202,8 @@ def facts(design: Design) -> dict[str, Any]:
         "travel_mm": design.job.travel_mm,
         "cut_time_s": design.job.time_s,
     }
+    if design.sheets:
+        found["sheets_mm"] = [list(one.drawing.size_mm) for one in design.sheets]
     if design.predicted is not None:
         deviation = design.predicted.deployed.deviation
         found |= {

@@ -18,10 +18,11 @@ from design.flatten import Flattening, Limits, feasibility, flatten
 from design.flatten.ladder import Remedy
 from design.job import Job, JobOptions, compose_job
 from design.pattern.assign import averaged, factor
-from design.pattern.border import framed
+from design.pattern.border import framed, piece_of
 from design.pattern.drawing import Drawing
 from design.pattern.paths import Layer, LayerPreset
 from design.pattern.seams import Pair, label_paths, seam_pairs
+from design.pattern.sheets import Split, fits, split
 from design.pattern.slits import hinge_widths_mm, outline_loops, slit_paths, slits_of
 from design.pattern.tiling import Array, Place, Tiling, best_place, tile
 from design.pattern.tubes import period_mm, tile_tube
@@ -56,6 +57,14 @@ class Cells:
 
 
 @dataclass(frozen=True, slots=True)
+class SheetCut:
+    """One of several sheets of a design: what is drawn on it, in its own millimetres, and its program."""
+
+    drawing: Drawing
+    job: Job
+
+
+@dataclass(frozen=True, slots=True)
 class Design:
     """Everything a design folder holds, before it is written."""
 
@@ -69,6 +78,7 @@ class Design:
     predicted: Predicted | None
     findings: tuple[Finding, ...]
     library_hash: str
+    sheets: tuple[SheetCut, ...] = ()  # where the whole is larger than the bed
 
 
 def build(
@@ -93,18 +103,23 @@ def build(
     hinge = hinge_widths_mm(choice.expansion_ratio, spec.hinge)
     watch("drawing slits", 0.4)
     cells = Cells(tiling, wanted, choice, hinge, kinds_of(spec, tiling))
-    drawing, shift, labelled = draw(spec, cells, library.sheet, placed)
-    found += sheet_findings(spec, drawing, placed, labelled)
+    drawing, shift, labelled, parted = draw(spec, cells, library.sheet, placed)
+    found += sheet_findings(spec, drawing, placed, labelled, parted)
     cells = replace(cells, tiling=tiling.moved(shift))
     placed = placed.moved_to(placed.flat_mm + shift)
     watch("ordering the cut", 0.5)
-    job = compose_job(drawing, presets, JobOptions(tool=spec.tool, spread_mm=spec.spread_mm), remarks=[spec.name])
+    options = JobOptions(tool=spec.tool, spread_mm=spec.spread_mm)
+    job = compose_job(drawing, presets, options, remarks=[spec.name])
+    sheets = tuple(
+        SheetCut(one, compose_job(one, presets, options, remarks=[f"{spec.name}, sheet {k + 1}"]))
+        for k, one in enumerate(parted.drawings if parted else ())
+    )
     predicted = None
     if spec.response is not None:
         watch("deploying the sheet", 0.6)
         predicted = predict(placed, cells.tiling, choice, cells.cut(), library, spec.response, watch)
         found += predicted.findings
-    return Design(spec, library.sheet, mesh, placed, cells, drawing, job, predicted, tuple(found), library.hash)
+    return Design(spec, library.sheet, mesh, placed, cells, drawing, job, predicted, tuple(found), library.hash, sheets)
 
 
 def lay_flat(spec: DesignSpec, mesh: TriMesh, curve: SelectionCurve | None, found: list[Finding]) -> Flattening:
@@ -224,18 +239,15 @@ def kinds_of(spec: DesignSpec, tiling: Tiling) -> tuple[str, ...]:
     return tuple("passive" if stays else "cut" for stays in passive)
 
 
-def sheet_findings(spec: DesignSpec, drawing: Drawing, flat: Flattening, labelled: Sequence[Pair]) -> list[Finding]:
+def sheet_findings(
+    spec: DesignSpec, drawing: Drawing, flat: Flattening, labelled: Sequence[Pair], parted: Split | None
+) -> list[Finding]:
     """Return what is doubtful about the sheet as it is drawn, and which labels help to join it."""
     found = []
     if drawing.id_anchor is None and spec.border.id_height_mm > 0:
         found.append(Finding("ID-PLACE", "no lower edge has room for the tag: no id can be engraved", "warning"))
-    width, height = drawing.size_mm
-    if spec.bed_mm is not None and (width > max(spec.bed_mm) or min(width, height) > min(spec.bed_mm)):
-        bed = f"{spec.bed_mm[0]:g} × {spec.bed_mm[1]:g} mm"
-        text = f"the sheet of {width:.0f} × {height:.0f} mm is larger than the bed of {bed}"
-        found.append(
-            Finding("SHEET-BED", text, "warning", hint="take smaller cells, the high end of expansions, cones")
-        )
+    if spec.bed_mm is not None and not fits(drawing.size_mm, spec.bed_mm):
+        found.append(bed_finding(drawing, spec.bed_mm, parted))
     open_seams = [seam for seam in flat.seams if not seam.closes_tube]
     if open_seams:
         text = f"the flat has {len(open_seams)} seam(s) to cones; cells do not run on across them"
@@ -248,12 +260,37 @@ def sheet_findings(spec: DesignSpec, drawing: Drawing, flat: Flattening, labelle
     return found
 
 
-def draw(spec: DesignSpec, cells: Cells, sheet: Sheet, flat: Flattening) -> tuple[Drawing, Array, list[Pair]]:
-    """Return the drawing of the cells with everything around them, by how much it moved them, and the seams' labels."""
+def bed_finding(drawing: Drawing, bed_mm: tuple[float, float], parted: Split | None) -> Finding:
+    """Return what follows from a sheet that is larger than the bed."""
+    width, height = drawing.size_mm
+    text = f"the sheet of {width:.0f} × {height:.0f} mm is larger than the bed of {bed_mm[0]:g} × {bed_mm[1]:g} mm"
+    if parted is None:
+        hint = "take smaller cells, the high end of expansions, cones"
+        return Finding(
+            "SHEET-BED", f"{text}, and no part of it with its tag and margins is small enough", "warning", hint=hint
+        )
+    count, labels = len(parted.drawings), len(parted.pairs)
+    text = f"{text}: it is split over {count} sheets, and {labels} pairs of cells that meet are labelled 1 to {labels}"
+    return Finding(
+        "SHEET-SPLIT", text, "warning", hint="cut each by `--sheet N`; join the sheets before they are opened"
+    )
+
+
+def draw(
+    spec: DesignSpec, cells: Cells, sheet: Sheet, flat: Flattening
+) -> tuple[Drawing, Array, list[Pair], Split | None]:
+    """Return the drawing of the cells with everything around them, by how much it moved them, and the seams' labels.
+
+    Where it is larger than the bed, also how it is split over sheets, if it can be.
+    """
     tiling, choice, cut = cells.tiling, cells.choice, cells.cut()
     slits = slits_of(tiling, choice.t_mm, choice.theta_rad, cells.hinge_mm, sheet.slit_mm, cut)
     paths = slit_paths(tiling, slits, cut)
     mouths = np.array([path.points_mm[-1] for path in paths if path.opens]).reshape(-1, 2)
     labels, labelled = label_paths(tiling, slits, cut, seam_pairs(tiling, flat))
-    drawing, shift = framed(outline_loops(tiling), mouths, paths + labels, spec.border, spec.cell_mm)
-    return drawing, shift, labelled
+    piece = piece_of(outline_loops(tiling), spec.border.margin_mm)
+    drawing, shift = framed(piece, mouths, paths + labels, spec.border, spec.cell_mm)
+    parted = None
+    if spec.bed_mm is not None and not fits(drawing.size_mm, spec.bed_mm):
+        parted = split(tiling, slits, cut, spec.border, spec.bed_mm, labels)
+    return drawing, shift, labelled, parted

@@ -41,23 +41,22 @@ class BorderOptions:
 
 
 def framed(
-    loops_mm: Sequence[Array],
+    piece: BaseGeometry,
     mouths_mm: Array,
     paths: Sequence[CutPath],
     options: BorderOptions,
     edge_mm: float,
+    joins: BaseGeometry | None = None,
 ) -> tuple[Drawing, Array]:
     """Return the whole drawing, with its lower left corner in the origin, and by how much all was moved, `(2,)`.
 
-    `loops_mm` bound the cells, `mouths_mm` `(b, 2)` are where slits open on that border; the tag's neck keeps clear of
-    them where it can. Where no lower edge has room for the tag, there is none.
+    `piece` is the cells with their rim, `mouths_mm` `(b, 2)` are where slits open on the cells' border; the tag's neck
+    keeps clear of them where it can, and of what will be joined on at `joins`. Where no lower edge has room for the
+    tag, there is none.
     """
-    piece = _polygon(loops_mm)
-    if options.margin_mm > 0:
-        piece = piece.buffer(options.margin_mm, join_style="mitre", mitre_limit=2.0)
     anchor, code = None, None
     if options.id_height_mm > 0:
-        piece, anchor, code = _with_tag(piece, mouths_mm, options, edge_mm)
+        piece, anchor, code = _with_tag(piece, mouths_mm, options, edge_mm, joins)
     low_x, low_y, high_x, high_y = piece.bounds
     room = options.sheet_margin_mm
     shift = np.array([room - low_x, room - low_y])
@@ -77,10 +76,16 @@ def framed(
     )
 
 
-def _polygon(loops_mm: Sequence[Array]) -> BaseGeometry:
+def piece_of(loops_mm: Sequence[Array], margin_mm: float = 0.0) -> BaseGeometry:
+    """Return the area that loops bound, with a rim of `margin_mm` around it."""
     outer = [shapely.Polygon(loop) for loop in loops_mm if shapely.LinearRing(loop).is_ccw]
     inner = [shapely.Polygon(loop) for loop in loops_mm if not shapely.LinearRing(loop).is_ccw]
-    return shapely.union_all(outer).difference(shapely.union_all(inner))
+    return rimmed_by(shapely.union_all(outer).difference(shapely.union_all(inner)), margin_mm)
+
+
+def rimmed_by(piece: BaseGeometry, margin_mm: float) -> BaseGeometry:
+    """Return a piece grown by a rim."""
+    return piece.buffer(margin_mm, join_style="mitre", mitre_limit=2.0) if margin_mm > 0 else piece
 
 
 def _rings(piece: BaseGeometry) -> list[Array]:
@@ -116,7 +121,7 @@ def registration_marks(size_mm: tuple[float, float], options: BorderOptions) -> 
 
 
 def _with_tag(
-    piece: BaseGeometry, mouths_mm: Array, options: BorderOptions, edge_mm: float
+    piece: BaseGeometry, mouths_mm: Array, options: BorderOptions, edge_mm: float, joins: BaseGeometry | None
 ) -> tuple[BaseGeometry, Anchor | None, Box | None]:
     """Return the piece with a tag hanging from its lowest edge that has room, and the places on the tag.
 
@@ -125,11 +130,12 @@ def _with_tag(
     code_width, code_height = (count * options.code_module_mm for count in CODE_MODULES)
     width = max(options.id_width_mm, code_width) + 2 * CLEARANCE_MM
     height = options.id_height_mm + 2 * CLEARANCE_MM + (code_height + CLEARANCE_MM if code_height > 0 else 0.0)
-    clear = np.zeros((0, 2)) if options.margin_mm > 0 else mouths_mm
     narrow = min(NECK_MM, edge_mm / 3)
     # Cells too small to pass between their mouths: the neck closes a few of them.
-    places = [(at, narrow) for at in _neck_places(piece, clear, narrow)]
+    places = [(at, narrow) for at in _neck_places(piece, mouths_mm, narrow)]
     places += [(at, NECK_MM) for at in _neck_places(piece, np.zeros((0, 2)), NECK_MM)]
+    if joins is not None:
+        places.sort(key=lambda place: joins.distance(shapely.Point(place[0])) < CLEARANCE_MM)
     for (x, y), neck in places:
         body = shapely.box(x - width / 2, y - CLEARANCE_MM - height, x + width / 2, y - CLEARANCE_MM)
         if body.distance(piece) < CLEARANCE_MM - 1e-9:

@@ -22,6 +22,7 @@ command.add_command(inspect_command)
 @command.command("run")
 @click.argument("design", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--material", help="Material file or its name  [the design's own].")
+@click.option("--sheet", type=click.IntRange(1), help="Sheet to cut, of a design that is split over several.")
 @click.option(
     "--origin",
     type=click.Choice(["home", "here", "camera"]),
@@ -41,6 +42,7 @@ command.add_command(inspect_command)
 def run(
     design: Path,
     material: str | None,
+    sheet: int | None,
     origin: str,
     camera_file: Path | None,
     frame: bool,
@@ -65,7 +67,7 @@ def run(
     chosen = load_material(material or spec.material, home.root)
     order = CutOrder(
         design=design,
-        compose=composer(bundle, spec, chosen),
+        compose=composer(bundle, spec, chosen, sheet),
         material=chosen,
         sheet=sheet_of(spec, home.root),
         origin=origin,  # type: ignore[arg-type]  # click.Choice has checked it

@@ -28,12 +28,15 @@ def sheet_of(spec: SpecConfig, home: Path) -> Sheet:
     return Sheet(material.name, material.thickness_mm)
 
 
-def composer(bundle: Bundle, spec: SpecConfig, material: MaterialConfig) -> Compose:
-    """Return the function that makes the program for a specimen's id and a board's full power."""
+def composer(bundle: Bundle, spec: SpecConfig, material: MaterialConfig, sheet: int | None = None) -> Compose:
+    """Return the function that makes the program for a specimen's id and a board's full power.
+
+    `sheet`, from 1, is one of those that a design larger than the bed is split over.
+    """
     tool = spec.tool.model_dump(exclude={"kerf_mm", "spread_mm"})
     kerf_mm = spec.tool.kerf_mm or (material.laser.kerf_mm if material.laser is not None else 0.1)
     presets = presets_of(material)
-    drawing = bundle.drawing()
+    drawing = bundle.drawing(sheet)
 
     def compose(specimen: str, s_max_count: float) -> tuple[str, ...]:
         options = JobOptions(

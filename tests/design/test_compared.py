@@ -55,4 +55,4 @@ def test_passive_cells_are_not_cut_and_a_comparison_counts_what_is_shared(tmp_pa
 
 def test_a_sheet_larger_than_the_bed_is_said_so() -> None:
     codes = {finding.code for finding in build(replace(SPEC, bed_mm=(50, 50)), MESH, load_library(), PRESETS).findings}
-    assert "SHEET-BED" in codes
+    assert "SHEET-SPLIT" in codes
