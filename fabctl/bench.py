@@ -56,6 +56,9 @@ class Bench:
         if slot is None:
             return
         for name in ("deployed.ply", "response.csv"):
+            if not (design / name).is_file():
+                (slot / name).unlink(missing_ok=True)  # a design without a prediction must not inherit the last one's
+                continue
             draft = slot / f".{name}.new"
             shutil.copyfile(design / name, draft)
             draft.replace(slot / name)

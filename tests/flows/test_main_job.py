@@ -32,10 +32,9 @@ def test_design_cut_indent_scan_and_report_agree_with_the_answer_key(simulated_b
     # the curve: what the rig measured is what the specimen was made to answer
     measured, predicted = found["indent"]["stiffness_secant_N_mm"], found["indent"]["predicted_secant_N_mm"]
     assert measured == pytest.approx(predicted, rel=0.1)
-    # the scan: the scale the scanner hid is found
-    keys = [json.loads(p.read_text()) for p in (home / "bench-state/sim/truth").glob("scan-truth.json")]
-    assert len(keys) == 1
-    assert found["scan"]["pose"]["unit_mm"] == pytest.approx(1 / keys[0]["scale_ratio"], rel=0.005)
+    # the scan: the scale the scanner hid, between 0.01 and 100, is found but for what the sheet itself is too large
+    key = json.loads((home / "bench-state/sim/truth/scan-truth.json").read_text())
+    assert found["scan"]["pose"]["unit_mm"] == pytest.approx(1 / key["scale_ratio"], rel=0.04)
     assert found["verdict"] == "pass"
     page = Path(found["report"]).read_text()
     assert "S-0001" in page
