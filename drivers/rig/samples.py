@@ -64,6 +64,7 @@ class Freshness:
             raise BadReply(f"status: the block's check {values['check']} does not fit its words")
         if "request_echo" in values and values["request_echo"] != asked.request:
             raise BadReply(f"status: answers request {values['request_echo']}, asked was {asked.request}: stale")
+        self._doubt_a_pause(asked)
         sequence, heartbeat = int(values["sequence"]), int(values.get("heartbeat", -1))
         self._elapsed_ticks += self._advance(sequence, heartbeat, asked)
         self._last = (sequence, heartbeat, asked)
@@ -78,6 +79,13 @@ class Freshness:
             command_state=_name(self._map.command_states, int(values["command_state"])),
             reason=_name(self._map.reasons, int(values["command_reason"])),
         )
+
+    def _doubt_a_pause(self, asked: Asked) -> None:
+        """Refuse a reply during which the host itself stood still: its clock cannot bound the reply's age then."""
+        took_s = asked.received_s - asked.sent_s
+        most_s = self._map.timeout_s + self._map.response_max_s + SLACK_S
+        if took_s > most_s:
+            raise BadReply(f"status: took {took_s:.3f} s by the host's clock, at most {most_s:.3f} s can be judged")
 
     def _advance(self, sequence: int, heartbeat: int, asked: Asked) -> int:
         if self._last is None:

@@ -123,3 +123,9 @@ def test_a_map_without_check_echo_and_heartbeat_is_still_judged_by_its_sequence(
     assert fresh.believe(words(1010), asked(2, 1.01)).sequence == 1010
     with pytest.raises(BadReply, match="frozen"):
         fresh.believe(words(1010), asked(3, 1.02))
+
+
+def test_a_reply_during_which_the_host_stood_still_is_not_believed() -> None:
+    # 0.19 s lie within the 0.6 s the question was open, but so would a sequence number that had jumped
+    with pytest.raises(BadReply, match="host's clock"):
+        awake().believe(block(1200, 3), Asked(3, 1.02, 1.62))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 
 import pytest
 
@@ -42,8 +43,11 @@ def test_a_hertzian_contact_has_no_initial_stiffness() -> None:
 
 
 def test_extrema_and_barrier_of_a_cubic_are_found() -> None:
-    found = result(bistable(2.5, 9.0), 11.0)
-    assert found.peak_depth_mm == pytest.approx(2.5, abs=0.01)
+    many = [result(bistable(2.5, 9.0), 11.0, seed=seed) for seed in range(2, 7)]
+    off_mm = [abs((one.peak_depth_mm or math.inf) - 2.5) for one in many]
+    assert statistics.median(off_mm) < 0.005, "half a sample: what noise of 5 mN leaves of a flat top"
+    assert max(off_mm) < 0.03
+    found = many[0]
     zero_mm = 0.75 * 11.5 - math.sqrt((0.75 * 11.5) ** 2 - 3 * 2.5 * 9)
     barrier = 0.02 * (zero_mm**4 / 4 - 0.5 * 11.5 * zero_mm**3 + 1.5 * 2.5 * 9 * zero_mm**2)
     assert found.barrier_mJ == pytest.approx(barrier, rel=0.01)
