@@ -145,7 +145,8 @@ def show_command(file: Path | None, as_json: bool) -> None:
 @click.option("--t-mm", type=float, help="Plot energy and force of this cell instead of the maps.")
 @click.option("--theta-deg", type=float)
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("library.svg"), show_default=True)
-def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output: Path) -> None:
+@json_option
+def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output: Path, as_json: bool) -> None:
     """Draw the four maps, or energy and force of one cell along its uniaxial stretch."""
     from design.cells.homogenise import Failure, solve_pair
     from design.cells.library import energy_scale_mJ, load_library
@@ -166,7 +167,7 @@ def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output:
         curve = uniaxial_curve(periodic_cell(m), pair.stable.s_ratio + 0.03)
         title = f"t = {t_mm:g} mm, θ = {theta_deg:g}°"
         pictures.save(pictures.energy(curve, energy_scale_mJ(library.sheet), title), output)
-    click.echo(str(output))
+    show({"picture": str(output), "library": library.hash}, as_json, [str(output)])
 
 
 def _refuse(t_mm: float, theta_deg: float, why: Failure) -> NoReturn:
