@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.cells.library import CellLibrary
+from design.cells.monostable import monostable_cells
 from design.cells.select import Choice, SelectionCurve, on_curve, select, selection_curve
 from design.cells.sheet import Sheet
 from design.errors import OutOfLibrary
@@ -27,7 +28,7 @@ from design.pattern.slits import hinge_widths_mm, outline_loops, slit_paths, sli
 from design.pattern.tiling import Array, Place, Tiling, best_place, tile
 from design.pattern.tubes import period_mm, tile_tube
 from design.predicted import Predicted, predict
-from design.spec import DesignSpec
+from design.spec import DesignSpec, Region
 from design.surface import TriMesh
 
 SCALE_ROUNDS_COUNT = 24
@@ -49,11 +50,15 @@ class Cells:
     wanted_ratio: Array
     choice: Choice
     hinge_mm: Array
-    kind: tuple[str, ...]  # cut or passive
+    kind: tuple[str, ...]  # cut, passive (no slits) or monostable (slits that close again)
 
     def cut(self) -> NDArray[np.bool_]:
         """Say which cells have slits."""
         return np.array([kind != "passive" for kind in self.kind])
+
+    def bistable(self) -> NDArray[np.bool_]:
+        """Say which cells stay open."""
+        return np.array([kind == "cut" for kind in self.kind])
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +107,7 @@ def build(
     placed, tiling, wanted, choice = choose(spec, flat, library, curve, found)
     hinge = hinge_widths_mm(choice.expansion_ratio, spec.hinge)
     watch("drawing slits", 0.4)
-    cells = Cells(tiling, wanted, choice, hinge, kinds_of(spec, tiling))
+    cells = with_monostable(Cells(tiling, wanted, choice, hinge, kinds_of(spec, tiling)), library, found)
     drawing, shift, labelled, parted = draw(spec, cells, library.sheet, placed)
     found += sheet_findings(spec, drawing, placed, labelled, parted)
     cells = replace(cells, tiling=tiling.moved(shift))
@@ -117,7 +122,7 @@ def build(
     predicted = None
     if spec.response is not None:
         watch("deploying the sheet", 0.6)
-        predicted = predict(placed, cells.tiling, choice, cells.cut(), library, spec.response, watch)
+        predicted = predict(placed, cells.tiling, choice, cells.bistable(), library, spec.response, watch)
         found += predicted.findings
     return Design(spec, library.sheet, mesh, placed, cells, drawing, job, predicted, tuple(found), library.hash, sheets)
 
@@ -230,13 +235,34 @@ def _faces_range(flat: Flattening) -> tuple[float, float]:
 
 
 def kinds_of(spec: DesignSpec, tiling: Tiling) -> tuple[str, ...]:
-    """Return for each cell whether it is cut or passive."""
+    """Return what each cell is: cut, monostable or passive, the last where regions overlap."""
+    passive, monostable = within(spec.passive, tiling), within(spec.monostable, tiling)
+    return tuple(np.select([passive, monostable], ["passive", "monostable"], "cut").tolist())
+
+
+def within(regions: Sequence[Region], tiling: Tiling) -> NDArray[np.bool_]:
+    """Say which cells have their middle in one of the circles."""
     middle = (tiling.vertices_mm.min(axis=0) + tiling.vertices_mm.max(axis=0)) / 2
     from_middle = tiling.centres_mm() - middle
-    passive = np.zeros(len(tiling.cells), dtype=bool)
-    for region in spec.passive:
-        passive |= np.linalg.norm(from_middle - [region.x_mm, region.y_mm], axis=1) < region.radius_mm
-    return tuple("passive" if stays else "cut" for stays in passive)
+    found = np.zeros(len(tiling.cells), dtype=bool)
+    for region in regions:
+        found |= np.linalg.norm(from_middle - [region.x_mm, region.y_mm], axis=1) < region.radius_mm
+    return found
+
+
+def with_monostable(cells: Cells, library: CellLibrary, found: list[Finding]) -> Cells:
+    """Return the cells with those that are to spring back replaced by cells that the library knows to do so."""
+    mono = np.array([kind == "monostable" for kind in cells.kind])
+    if not mono.any():
+        return cells
+    choice = cells.choice
+    t_mm, theta_rad, expansion_ratio = choice.t_mm.copy(), choice.theta_rad.copy(), choice.expansion_ratio.copy()
+    t_mm[mono], theta_rad[mono] = monostable_cells(library, choice.theta_rad[mono])
+    expansion_ratio[mono] = 1.0
+    stiffness_mJ, barrier_mJ = np.where(mono, 0.0, choice.stiffness_mJ), np.where(mono, 0.0, choice.barrier_mJ)
+    text = f"{int(mono.sum())} cells have slits but spring back to flat; the prediction takes them as uncut"
+    found.append(Finding("CELLS-MONOSTABLE", text, "warning", hint="they are softer than that: take shape with care"))
+    return replace(cells, choice=Choice(t_mm, theta_rad, expansion_ratio, stiffness_mJ, barrier_mJ))
 
 
 def sheet_findings(

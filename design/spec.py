@@ -18,7 +18,7 @@ Infeasible = Literal["report", "cones", "nearest", "both"]
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """A circle whose cells are not cut: they stay flat and stiff. `x_mm`, `y_mm` from the middle of the cells' box."""
+    """A circle of cells that are not as the others. `x_mm`, `y_mm` from the middle of the cells' box."""
 
     x_mm: float
     y_mm: float
@@ -48,7 +48,8 @@ class DesignSpec:
     selection: SelectionOptions = field(default_factory=SelectionOptions)
     placement: Placement = "optimised"
     hinge: HingeOptions = field(default_factory=HingeOptions)
-    passive: tuple[Region, ...] = ()
+    passive: tuple[Region, ...] = ()  # not cut: flat and stiff
+    monostable: tuple[Region, ...] = ()  # cut, but they spring back
     border: BorderOptions = field(default_factory=BorderOptions)
     tool: ToolOptions = field(default_factory=ToolOptions)
     spread_mm: float = 0.0

@@ -87,7 +87,7 @@ class HingeConfig(Model):
 
 
 class RegionConfig(Model):
-    """A circle whose cells are not cut, from the middle of the cells' box."""
+    """A circle of cells that are not as the others, from the middle of the cells' box."""
 
     x_mm: float
     y_mm: float
@@ -144,6 +144,7 @@ class SpecConfig(Model):
     placement: Placement = "optimised"
     hinge: HingeConfig = HingeConfig()
     passive: tuple[RegionConfig, ...] = ()
+    monostable: tuple[RegionConfig, ...] = ()
     border: BorderConfig = BorderConfig()
     tool: ToolConfig = ToolConfig()
     bed_mm: tuple[Positive, Positive] | None = None
@@ -167,6 +168,7 @@ class SpecConfig(Model):
             placement=self.placement,
             hinge=HingeOptions(self.hinge.rule, hinge, self.hinge.added_mm),
             passive=tuple(Region(**region.model_dump()) for region in self.passive),
+            monostable=tuple(Region(**region.model_dump()) for region in self.monostable),
             border=BorderOptions(**self.border.model_dump()),
             tool=ToolOptions(kerf_mm=self.tool.kerf_mm or kerf_mm, **tool),
             spread_mm=self.tool.spread_mm,
