@@ -61,6 +61,12 @@ def read_laid(folder: Path, home: Path) -> Laid:
     nu = np.where(np.isfinite(cells.nu_tangent_ratio), cells.nu_tangent_ratio, mean)
     Y = np.where(np.isfinite(cells.Y_N_mm), cells.Y_N_mm, np.nanmean(cells.Y_N_mm))
     D = np.asarray(load_bending().D_mJ(expansion, theta, sheet))
+    # Cells that do not stay open are as the build's own prediction takes them: solid.
+    stays_open = np.array([row["kind"] == "cut" for row in rows])
+    expansion = np.where(stays_open, expansion, 1.0)
+    Y = np.where(stays_open, Y, sheet.E_MPa * sheet.thickness_mm)
+    nu = np.where(stays_open, nu, sheet.nu_ratio)
+    D = np.where(stays_open, D, sheet.E_MPa * sheet.thickness_mm**3 / 12)
     target, _ = read_mesh(bundle.file("target.ply"))
     paper, _ = read_mesh(bundle.file("flat.ply"))
     goal = None

@@ -55,3 +55,18 @@ def test_a_folder_that_was_edited_is_refused(folder: Path) -> None:
             read_laid(folder, folder.parent)
     finally:
         cells.write_bytes(before)
+
+
+def test_cells_that_do_not_stay_open_are_solid_as_in_the_builds_prediction(tmp_path: Path) -> None:
+    text = "name: x\ntarget: {make: cap, radius_mm: 40, edge_mm: 4}\nresponse: {steps_count: 4, depth_mm: 2}\n"
+    regions = "monostable: [{x_mm: 0, y_mm: 0, radius_mm: 12}]\npassive: [{x_mm: 0, y_mm: 0, radius_mm: 7}]\n"
+    (tmp_path / "x.yaml").write_text(text + regions)
+    design, _ = build_folder(str(tmp_path / "x.yaml"), tmp_path / "x", tmp_path)
+    laid = read_laid(tmp_path / "x", tmp_path)
+    closed = np.array([kind != "cut" for kind in design.cells.kind])
+    assert {"passive", "monostable"} <= set(design.cells.kind)
+    assert (laid.layout.expansion_ratio[closed] == 1).all()
+    assert (laid.layout.expansion_ratio[~closed] > 1.1).all()
+    solid_N_mm = laid.sheet.E_MPa * laid.sheet.thickness_mm
+    assert laid.layout.Y_N_mm[closed] == pytest.approx(solid_N_mm)
+    assert (laid.layout.Y_N_mm[~closed] < solid_N_mm).all()
