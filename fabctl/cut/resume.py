@@ -36,8 +36,8 @@ from fabctl.cut.trail import burnt_before_mm, read_trail, rest_of, stopped_at, s
 from fabctl.cut.wirelog import WireLog
 from fabctl.errors import RefusedError, Stopped, UsageError
 from fabctl.events import Event
-from fabctl.records.folder import RunFolder, open_run, start_run, status_of
-from fabctl.workspace import Workspace
+from fabctl.records.folder import RunFolder, open_run, sha256, start_run, status_of
+from fabctl.workspace import Specimen, Workspace
 
 OFFSET_MM = 0.0005
 
@@ -49,6 +49,9 @@ def resume(lab: Workspace, bench: Bench, order: CutOrder, path: Path, desk: Desk
     """
     before = _interrupted(path)
     specimen = lab.specimen(str(before.manifest()["specimen"]))
+    found = against_resuming(lab, before, specimen, order.design)
+    if found:
+        raise RefusedError("the cut cannot be resumed", found)
     log = WireLog()
     try:
         with laser_on(bench, log) as laser:
@@ -71,6 +74,24 @@ def resume(lab: Workspace, bench: Bench, order: CutOrder, path: Path, desk: Desk
             return CutDone(plan, specimen, run, {**result, "resumed": before.run_id})
     finally:
         log.close()
+
+
+def against_resuming(lab: Workspace, before: RunFolder, specimen: Specimen, design: Path) -> list[Finding]:
+    """Return why going on would burn a line twice, or cut another design than the one that was begun."""
+    found = []
+    for later in lab.runs_of(specimen.name, "cut"):
+        if later.manifest()["config"].get("resumed") == before.run_id and status_of(later) != "refused":
+            text = f"{before.run_id} has already been gone on with, in {later.run_id} ({status_of(later)})"
+            found.append(Finding("RESUME-TWICE", text, hint=f"look at that run: fabctl run show {later.run_id}"))
+    if _identity(design) != _identity(specimen.design):
+        text = f"{before.run_id} cut {specimen.name} from another design than {design}"
+        found.append(Finding("RESUME-DESIGN", text, hint=f"fabctl cut run {specimen.design} --resume {before.run_id}"))
+    return found
+
+
+def _identity(design: Path) -> str:
+    manifest = design / "manifest.json"
+    return sha256(manifest) if manifest.is_file() else ""
 
 
 def _interrupted(path: Path) -> RunFolder:

@@ -152,7 +152,12 @@ def run_test(
         except (DeviceError, FabctlError) as fault:
             run.finish("failed", str(fault))
             raise
-    run.write_result(result_of(run, plan, ending))
+    body = result_of(run, plan, ending)
+    run.write_result(body)
+    if body["curves"] and all(curve["contact_mm"] is None for curve in body["curves"]):
+        reason = "no curve has a contact: was a specimen in place, and the indenter free when it was tared?"
+        run.finish("failed", reason)
+        raise RefusedError(f"{run.run_id}: nothing was measured", [Finding("INDENT-NO-CONTACT", reason)])
     run.finish("done")
     return run
 

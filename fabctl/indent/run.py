@@ -13,12 +13,13 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from design.findings import Finding
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.rig.indenter import LOST, Indenter, Limits, RigFaulted, ended
 from drivers.rig.samples import Restarted, Sample
 from fabctl.clock import Clock
 from fabctl.config.method import MethodConfig
-from fabctl.errors import FabctlError, Stopped
+from fabctl.errors import FabctlError, RefusedError, Stopped
 from fabctl.events import Emit, Event, silent
 from fabctl.indent.contact import first_touch
 from fabctl.indent.method import Action, time_s
@@ -27,6 +28,8 @@ from fabctl.indent.recorder import Row
 Wish = Literal["go", "pause", "stop"]
 SHOWN_HZ = 12.0
 HOMING_MM_S = 8.0
+STANDING_MM = 1.0  # the safe heights of two methods differ by less; a pressed specimen is farther down
+HARMLESS = ("unhomed", "restarted")  # what a controller says after it was switched on
 FREE_S, FREE_SIGMA, FREE_FRAC = 0.25, 4.0, 0.1
 MORE_ROOM_COUNT = 6
 
@@ -55,6 +58,22 @@ class NoContact(FabctlError):
 
 class ForceOffZero(FabctlError):
     """The force before the test is nothing a free load cell shows."""
+
+
+def left_behind(now: Sample, safe_height_mm: float) -> list[Finding]:
+    """Return what an earlier run has left that a new one must not go on from: a latched fault, an indenter still down.
+
+    A tare taken on a pressed specimen would make every figure wrong, and the approach would press on from there.
+    """
+    found = []
+    latched = [fault for fault in now.faults if fault not in HARMLESS]
+    if latched:
+        hint = "look at the specimen, then `fabctl rig clear` and `fabctl rig retract`"
+        found.append(Finding("RIG-LATCHED", f"the controller still holds {', '.join(latched)}", hint=hint))
+    if "unhomed" not in now.faults and now.position_mm > safe_height_mm + STANDING_MM:
+        text = f"the indenter stands at {now.position_mm:.2f} mm, safe is {safe_height_mm:g} mm"
+        found.append(Finding("RIG-DOWN", text, hint="look at the specimen, then `fabctl rig retract`"))
+    return found
 
 
 @dataclass
@@ -117,6 +136,9 @@ class Runner:
 
     def _prepare(self) -> None:
         limits = self.method.limits
+        left = left_behind(self.rig.fresh_sample(), self.method.safe_height_mm)
+        if left:
+            raise RefusedError("the rig is not ready for a test", left)
         self.rig.clear_faults()
         self.rig.set_limits(
             Limits(

@@ -10,11 +10,12 @@ import pytest
 from benchmarks._rig_memory import REGISTERS, Kept, MemoryBus, method
 from drivers.errors import DeviceTimeout
 from drivers.rig.indenter import Indenter, RigFaulted
+from drivers.rig.samples import Sample
 from fabctl.config.method import MethodConfig
-from fabctl.errors import Stopped
+from fabctl.errors import RefusedError, Stopped
 from fabctl.events import Event
 from fabctl.indent.method import actions
-from fabctl.indent.run import ForceOffZero, NoContact, Runner, Wish
+from fabctl.indent.run import ForceOffZero, NoContact, Runner, Wish, left_behind
 from simulators.rig import registers as R
 from simulators.rig.controller import Controller, Machine
 from simulators.specimens.analytic import linear, softening
@@ -160,3 +161,23 @@ def test_only_fresh_samples_feed_the_watchdog() -> None:
     bench.runner.execute()
     fed = bench.device.last_feed
     assert fed in {row.sequence for row in bench.kept.rows}
+
+
+SAMPLE = Sample(1, 0.0, 0.2, 0.0, "disarmed", (), 0, "none", "none")
+
+
+def test_an_indenter_left_down_is_refused_before_anything_moves() -> None:
+    bench = Bench(linear(0.5), method(3.0, 2.0), wish=lambda b: "stop" if b.device.depth_mm > 2.0 else "go")
+    with pytest.raises(Stopped):
+        bench.runner.execute()
+    plan, before = method(3.0, 2.0), len(bench.codes())
+    again = Runner(bench.rig, plan, actions(plan), bench.kept, bench.bus, 100.0)
+    with pytest.raises(RefusedError, match="RIG-DOWN"):
+        again.execute()
+    assert set(bench.codes()[before:]) <= {R.STOP, R.DISARM}
+
+
+def test_a_latched_fault_is_not_cleared_behind_the_operators_back() -> None:
+    found = left_behind(replace(SAMPLE, faults=("watchdog",)), 1.0)
+    assert [finding.code for finding in found] == ["RIG-LATCHED"]
+    assert left_behind(replace(SAMPLE, faults=("unhomed", "restarted"), position_mm=9.0), 1.0) == []
