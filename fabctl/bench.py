@@ -78,10 +78,13 @@ def resolve(url: str, bench: str, state: Path) -> str:
 def announced(state: Path) -> dict[str, dict[str, Any]]:
     """Return what the started simulators said of themselves: name -> url, process."""
     path = state / "simulators.json"
-    if not path.is_file():
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return {str(name): facts for name, facts in found.items() if {"url", "process", "began"} <= set(facts)}
+    except FileNotFoundError:
         return {}
-    found: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
-    return found
+    except (ValueError, TypeError, AttributeError):
+        return {}  # damaged: `sim up` writes it anew, and a simulator that still runs keeps its own port
 
 
 @contextlib.contextmanager

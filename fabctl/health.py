@@ -89,6 +89,8 @@ def _import(name: str, module: str) -> Check:
 
 def _folder(lab: Workspace) -> Check:
     root = lab.root
+    if not root.exists() and os.access(root.parent, os.W_OK):
+        return Check("lab folder", True, f"{root} is not there yet; the first run makes it")
     if not root.is_dir() or not os.access(root, os.W_OK):
         return Check("lab folder", False, f"{root} cannot be written", "name another with --home or $FABCTL_HOME")
     free = shutil.disk_usage(root).free

@@ -67,7 +67,9 @@ class Workspace:
         """Return the specimen called `name`; raise `UsageError` with the known ones where there is none."""
         path = self.specimens / name
         if not SPECIMEN.fullmatch(name) or not (path / "specimen.json").is_file():
-            known = ", ".join(sorted(p.name for p in self.specimens.glob("S-*"))[-5:]) or "none yet"
+            known = (
+                ", ".join(sorted(p.parent.name for p in self.specimens.glob("S-*/specimen.json"))[-5:]) or "none yet"
+            )
             raise UsageError(f"no specimen {name!r} in {self.specimens} (the latest: {known})")
         return Specimen(path)
 
@@ -105,7 +107,13 @@ class Specimen:
 
     def record(self) -> dict[str, Any]:
         """Return what is written about the specimen."""
-        found: dict[str, Any] = json.loads((self.path / "specimen.json").read_text(encoding="utf-8"))
+        path = self.path / "specimen.json"
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as fault:
+            raise RecordError(f"{path}: cannot be read: {fault}") from fault
+        if not isinstance(found, dict):
+            raise RecordError(f"{path}: not a record")
         return found
 
     def note(self, **facts: Any) -> None:

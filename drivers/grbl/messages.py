@@ -6,6 +6,7 @@ that is none of the known ones is `Garbled`, never guessed at: an `ok` is exactl
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field
 
@@ -170,16 +171,24 @@ def parse_report(body: str) -> Report | Garbled:
     return Report(**values)  # type: ignore[arg-type]
 
 
+def finite(text: str) -> float:
+    """Return the number in `text`; raise `ValueError` for anything else, `nan` and `inf` included."""
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is not a number a machine can stand at")
+    return number
+
+
 def _field(name: str, text: str) -> dict[str, object]:
     if name in ("MPos", "WPos", "WCO"):
         key = {"MPos": "machine_mm", "WPos": "work_mm", "WCO": "offset_mm"}[name]
-        parts = [float(part) for part in text.split(",")]
+        parts = [finite(part) for part in text.split(",")]
         return {key: (parts[0], parts[1], parts[2] if len(parts) > 2 else 0.0)}
     if name == "FS":
         feed, speed = text.split(",")[:2]
-        return {"feed_mm_min": float(feed), "s_count": float(speed)}
+        return {"feed_mm_min": finite(feed), "s_count": finite(speed)}
     if name == "F":
-        return {"feed_mm_min": float(text)}
+        return {"feed_mm_min": finite(text)}
     if name == "Bf":
         blocks, free = text.split(",")
         return {"free_blocks": int(blocks), "free_bytes": int(free)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from drivers.grbl.messages import Banner, Info, Message, Report, Setting, Startup, Vector
+from drivers.grbl.messages import Banner, Info, Message, Report, Setting, Startup, Vector, finite
 
 RX_FALLBACK_BYTES = 128
 RX_LEAST_BYTES = 16
@@ -105,14 +105,14 @@ def _firmware(text: str, before: str) -> str:
 
 def _number(message: Setting) -> dict[int, float]:
     try:
-        return {message.number: float(message.value)}
+        return {message.number: finite(message.value)}
     except ValueError:
         return {}  # other dialects keep texts in some settings
 
 
 def _offset(message: Info) -> dict[str, Vector]:
     try:
-        parts = [float(part) for part in message.text.split(",")]
+        parts = [finite(part) for part in message.text.split(",")]
     except ValueError:
         return {}
     return {message.kind: (parts[0], parts[1], parts[2] if len(parts) > 2 else 0.0)}

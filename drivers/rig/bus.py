@@ -170,9 +170,9 @@ class ModbusBus:
 
 def open_bus(url: str, timeout_s: float, response_max_s: float) -> ModbusBus:
     """Open `modbus-tcp://host:port?unit=1` or `modbus-rtu:///dev/ttyUSB0?baud=115200&parity=E&unit=1`."""
-    parts = urlsplit(url)
-    options = {key: values[-1] for key, values in parse_qs(parts.query).items()}
     try:
+        parts = urlsplit(url)
+        options = {key: values[-1] for key, values in parse_qs(parts.query).items()}
         unit = int(options.pop("unit", "1"))
         client, serial_line = _client(url, parts, options, timeout_s)
     except ValueError as fault:

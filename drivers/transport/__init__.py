@@ -31,7 +31,10 @@ class Transport(Protocol):
 
 def open_transport(url: str) -> Transport:
     """Open the line that `url` names; raise `TransportError` saying why it cannot be."""
-    parts = urlsplit(url)
+    try:
+        parts = urlsplit(url)
+    except ValueError as fault:
+        raise TransportError(url, str(fault), "write serial:///dev/… or tcp://host:port") from fault
     if parts.scheme == "serial":
         from drivers.transport.serial import SerialTransport
 

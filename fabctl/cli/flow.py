@@ -8,13 +8,13 @@ import click
 
 from fabctl.bench import deployment_checklist, refuse_without
 from fabctl.cli.common import bench_option, json_option, lab, progress, say, show, yes_option
-from fabctl.config.bench import load_bench
+from fabctl.config.bench import find, load_bench
 from fabctl.errors import DONE, OUT_OF_TOLERANCE
 from fabctl.flow import Flow, Order, continued, runner, steps_after_deployment, steps_until_cut
 
 
 @click.command("flow")
-@click.argument("spec", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("spec", required=False)
 @click.option("--target", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Another target surface.")
 @click.option("--continue", "specimen", metavar="SPECIMEN", help="Go on with a sheet that was cut and is deployed.")
 @click.option(
@@ -26,7 +26,7 @@ from fabctl.flow import Flow, Order, continued, runner, steps_after_deployment, 
 @yes_option
 @json_option
 def command(
-    spec: Path | None,
+    spec: str | None,
     target: Path | None,
     specimen: str | None,
     method: str,
@@ -36,7 +36,7 @@ def command(
     yes: bool,
     as_json: bool,
 ) -> int:
-    """Take SPEC through every room: design, cut, indent, scan, report.
+    """Take SPEC, a file or a name in configs/specs, through every room: design, cut, indent, scan, report.
 
     On a bench where a person deploys the sheet, flow stops after the cut with a checklist;
     `--continue SPECIMEN` goes on.
@@ -52,7 +52,7 @@ def command(
         flow = continued(home, specimen)
     else:
         assert spec is not None
-        flow = steps_until_cut(home, order, spec, target, run, emit)
+        flow = steps_until_cut(home, order, find("specs", spec, home.root), target, run, emit)
         if bench.deployment == "by_hand":
             return _wait_for_a_person(flow, order, as_json)
     flow = steps_after_deployment(order, flow, run, emit)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fabctl.cli.common import json_option, lab, show
+
+if TYPE_CHECKING:
+    from fabctl.workspace import Specimen
 
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
@@ -26,9 +29,18 @@ def list_specimens(as_json: bool) -> None:
     names = sorted(p.parent.name for p in place.specimens.glob("S-*/specimen.json"))
     runs = place.all_runs()
     kinds = {name: [r.manifest()["kind"] for r in runs if r.manifest().get("specimen") == name] for name in names}
-    rows = [{**place.specimen(name).record(), "runs": kinds[name]} for name in names]
+    rows = [{**_record_or_fault(place.specimen(name)), "runs": kinds[name]} for name in names]
     lines = [f"{row['id']}  {row['made_utc'][:16]}  {', '.join(row['runs']) or 'no runs'}" for row in rows]
     show({"specimens": rows}, as_json, lines or ["no specimens yet; `fabctl cut run` gives the first id"])
+
+
+def _record_or_fault(specimen: Specimen) -> dict[str, Any]:
+    from fabctl.errors import RecordError
+
+    try:
+        return specimen.record()
+    except RecordError as fault:  # one damaged record must not hide the others
+        return {"id": specimen.name, "made_utc": "broken", "fault": str(fault)}
 
 
 @command.command("show")

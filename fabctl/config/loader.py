@@ -17,6 +17,7 @@ from fabctl.errors import ConfigError
 
 INT = re.compile(r"[-+]?[0-9]+")
 FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+DIGITS_COUNT = 19  # longer ones are nobody's measure: they become floats, and Python refuses to read very long integers
 WORDS: dict[str, bool | None] = {"true": True, "false": False, "null": None, "~": None, "": None}
 
 Marks = dict[tuple[str | int, ...], int]
@@ -50,19 +51,22 @@ def parse(text: str, model: type[M], name: str) -> M:
     complaints: list[str] = []
     try:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
+        data = _value(node, (), marks, complaints, name) if node is not None else {}
+    except RecursionError as fault:
+        raise ConfigError([f"{name}:1: nested too deeply, or an anchor that holds itself"]) from fault
     except yaml.YAMLError as fault:
         mark = getattr(fault, "problem_mark", None)
         line = f":{mark.line + 1}" if mark else ""
         raise ConfigError([f"{name}{line}: not YAML: {getattr(fault, 'problem', None) or fault}"]) from fault
-    data = _value(node, (), marks, complaints, name) if node is not None else {}
     if not isinstance(data, dict):
-        raise ConfigError([f"{name}:1: a mapping of keys was expected, not {type(data).__name__}"])
+        kind = "a list" if isinstance(data, tuple) else "one value"
+        raise ConfigError([f"{name}:1: a mapping of keys was expected, not {kind}"])
     try:
         checked = model.model_validate(data)
     except ValidationError as fault:
         complaints += [_complaint(error, marks, name) for error in fault.errors()]
     if complaints:
-        raise ConfigError(complaints)
+        raise ConfigError(sorted(complaints, key=_line_number))
     return checked
 
 
@@ -89,7 +93,7 @@ def _scalar(node: yaml.Node) -> Any:
         return text
     if text.lower() in WORDS:
         return WORDS[text.lower()]
-    if INT.fullmatch(text):
+    if INT.fullmatch(text) and len(text) < DIGITS_COUNT:
         return int(text)
     if FLOAT.fullmatch(text):
         return float(text)
@@ -99,10 +103,15 @@ def _scalar(node: yaml.Node) -> Any:
 def _complaint(error: Any, marks: Marks, name: str) -> str:
     path = tuple(error["loc"])
     line = next((marks[path[:k]] for k in range(len(path), -1, -1) if path[:k] in marks), 1)
-    text = error["msg"]
+    text = "unknown key" if error["type"] == "extra_forbidden" else str(error["msg"])
     if error["type"] not in ("missing", "extra_forbidden") and not isinstance(error["input"], dict | tuple):
         text += f", not {error['input']!r}"
     return f"{name}:{line}: {_dotted(path)}: {text}" if path else f"{name}:{line}: {text}"
+
+
+def _line_number(complaint: str) -> int:
+    found = re.search(r":(\d+): ", complaint)
+    return int(found[1]) if found else 0
 
 
 def _dotted(path: tuple[str | int, ...]) -> str:

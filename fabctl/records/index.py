@@ -6,6 +6,7 @@ changed since, are read again; folders that are gone are forgotten. Deleting the
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -46,17 +47,22 @@ def rows(runs: Path, index: Path | None = None) -> list[Row]:
     path = index or runs / "index.sqlite"
     try:
         return _rows(runs, path)
+    except (sqlite3.OperationalError, OSError):
+        pass  # a full disk, a folder one may only read: the list is still to be had
     except sqlite3.DatabaseError:
-        path.unlink(missing_ok=True)  # damaged: it is only derived
-        try:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)  # damaged: it is only derived
             return _rows(runs, path)
-        except sqlite3.Error as fault:
-            raise RecordError(f"{path}: the index cannot be written: {fault}") from fault
+    try:
+        return _rows(runs, Path(":memory:"))
+    except sqlite3.Error as fault:
+        raise RecordError(f"{runs}: the runs cannot be listed: {fault}") from fault
 
 
 def reindex(runs: Path) -> list[Row]:
     """Throw the index away and read every folder anew."""
-    (runs / "index.sqlite").unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        (runs / "index.sqlite").unlink(missing_ok=True)
     return rows(runs)
 
 
@@ -85,13 +91,14 @@ def _rows(runs: Path, path: Path) -> list[Row]:
 def _read(folder: Path) -> Row:
     try:
         run = open_run(folder)
-        manifest, outcome = run.manifest(), run.outcome()
-    except RecordError as fault:
-        return Row(folder.name, None, None, None, "broken", str(fault), None)
+        manifest, outcome, status = run.manifest(), run.outcome(), status_of(run)
+    except (RecordError, KeyError, ValueError, TypeError) as fault:
+        why = str(fault) if isinstance(fault, RecordError) else f"{folder}: not a whole record: {fault!r}"
+        return Row(folder.name, None, None, None, "broken", why, None)
     message = str((outcome or {}).get("message", ""))
     texts = [manifest.get(key) for key in ("kind", "specimen", "started_utc")]
     kind, specimen, started = (None if text is None else str(text) for text in texts)
-    return Row(folder.name, kind, specimen, started, status_of(run), message, str(manifest.get("operator")))
+    return Row(folder.name, kind, specimen, started, status, message, str(manifest.get("operator")))
 
 
 def _stamp_ns(folder: Path) -> int:

@@ -93,7 +93,11 @@ def plot(curves: Path, predicted: Path | None) -> Figure:
     axes.axhline(0, color="#999999", lw=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
-    return Figure(as_svg(canvas), "Force against displacement; the frame's give and the tare are taken off.", True)
+    return Figure(
+        as_svg(canvas),
+        "Force against displacement from contact. The tare is taken off, and the frame's give where it was calibrated.",
+        True,
+    )
 
 
 def as_svg(canvas: Any, dpi: float = 100.0) -> str:

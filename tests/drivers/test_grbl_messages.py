@@ -106,3 +106,10 @@ def test_every_number_has_a_meaning_and_a_remedy() -> None:
     for meaning, hint in [*ERRORS.values(), *ALARMS.values(), error_meaning(999), alarm_meaning(999)]:
         assert meaning
         assert hint
+
+
+@pytest.mark.parametrize(
+    "line", ["<Idle|MPos:nan,0.000,0.000|FS:0,0>", "<Idle|MPos:1e999,0,0>", "<Idle|MPos:0,0,0|FS:inf,0>"]
+)
+def test_a_place_that_is_no_number_is_not_a_report(line: str) -> None:
+    assert isinstance(parse_line(line)[0], Garbled)

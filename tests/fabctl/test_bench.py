@@ -95,3 +95,9 @@ def test_a_simulator_that_fails_says_why(tmp_path: Path) -> None:
 def test_a_simulator_that_is_not_up_names_the_command(tmp_path: Path) -> None:
     with open_bench(Workspace(tmp_path), config(), "x") as bench, pytest.raises(UsageError, match="fabctl sim up"):
         bench.url("laser")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"laser": {}}', '{"laser": 3}', ""])
+def test_a_damaged_list_of_simulators_is_no_list(tmp_path: Path, text: str) -> None:
+    (tmp_path / "simulators.json").write_text(text)
+    assert announced(tmp_path) == {}

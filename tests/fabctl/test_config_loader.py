@@ -30,10 +30,11 @@ def test_a_number_with_an_exponent_is_a_number() -> None:
 
 def test_all_faults_are_named_at_once_with_their_lines() -> None:
     found = complaints("name: lab\nlaser:\n  url: tcp://x:1\n  travel_mm: [300, wide]\n  travle_mm: 3\nname: again\n")
-    assert [line.split(": ")[0] for line in found] == ["lab.yaml:6", "lab.yaml:4", "lab.yaml:5"]
-    assert "given twice" in found[0]
-    assert "laser.travel_mm.1" in found[1]
-    assert "not 'wide'" in found[1]
+    assert [line.split(": ")[0] for line in found] == ["lab.yaml:4", "lab.yaml:5", "lab.yaml:6"]
+    assert "laser.travel_mm.1" in found[0]
+    assert "not 'wide'" in found[0]
+    assert "laser.travle_mm: unknown key" in found[1]
+    assert "given twice" in found[2]
 
 
 def test_the_word_on_stays_a_word() -> None:
@@ -46,3 +47,10 @@ def test_what_is_not_yaml_says_where() -> None:
 
 def test_an_empty_file_lacks_its_keys() -> None:
     assert complaints("") == ("lab.yaml:1: name: Field required",)
+
+
+@pytest.mark.parametrize(
+    "text", ["a: &a [*a]\n", "a: " + "[" * 3000, "name: lab\nlaser: " + "9" * 5000 + "\n", "- 1\n- 2\n"]
+)
+def test_what_would_exhaust_the_reader_is_refused_with_its_place(text: str) -> None:
+    assert complaints(text)[0].startswith("lab.yaml:")

@@ -152,3 +152,22 @@ def test_an_export_holds_every_file_and_its_hash(tmp_path: Path) -> None:
     with tarfile.open(tmp_path / "out.tar.gz") as archive:
         assert {name.split("/", 1)[1] for name in archive.getnames()} == set(hashes)
     assert set(hashes) == {"manifest.json", "outcome.json", "artefacts/job.nc"}
+
+
+@pytest.mark.parametrize("outcome", ["{}", '{"status": 3}', "[]", "{"])
+def test_one_bad_record_does_not_hide_the_others(tmp_path: Path, outcome: str) -> None:
+    good, bad = start_run(tmp_path, "cut"), start_run(tmp_path, "scan")
+    good.finish("done")
+    (bad.path / "outcome.json").write_text(outcome)
+    odd = start_run(tmp_path, "indent")
+    manifest = json.loads((odd.path / "manifest.json").read_text())
+    (odd.path / "manifest.json").write_text(json.dumps({**manifest, "started_utc": "x"}))
+    assert {row.run: row.status for row in rows(tmp_path)}[good.run_id] == "done"
+    assert {row.run: row.status for row in rows(tmp_path)}[odd.run_id] == "broken"
+
+
+def test_the_list_is_to_be_had_where_nothing_can_be_written(tmp_path: Path) -> None:
+    run = start_run(tmp_path, "cut")
+    run.finish("done")
+    (tmp_path / "index.sqlite").mkdir()
+    assert {row.run: row.status for row in rows(tmp_path)}[run.run_id] == "done"
