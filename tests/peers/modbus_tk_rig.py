@@ -6,6 +6,8 @@ modbus-tk answers function 23 before it has written, against the specification, 
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import sys
 import time
 from pathlib import Path
@@ -48,6 +50,15 @@ class Live:
         self._device.advance(max(0, behind))
 
 
+def await_listening(port: int) -> None:
+    """Return when the server accepts: it binds in a thread of its own, some time after `start` has returned."""
+    for _ in range(500):
+        with contextlib.suppress(ConnectionRefusedError), socket.create_connection(("127.0.0.1", port), 1.0):
+            return
+        time.sleep(0.01)
+    raise SystemExit(f"nothing listens on port {port}")
+
+
 def main(kind: str, where: str) -> None:
     device = Controller(Machine(noise_N=0.0, zero_N=0.0, backlash_mm=0.0), Specimen(linear(0.5)))
     if kind == "tcp":
@@ -61,6 +72,8 @@ def main(kind: str, where: str) -> None:
     slave._memory[cst.HOLDING_REGISTERS].append(Live("holding", device, began_s))
     slave._memory[cst.ANALOG_INPUTS].append(Live("input", device, began_s))
     server.start()
+    if kind == "tcp":
+        await_listening(int(where))
     print("ready", flush=True)
     while True:
         time.sleep(1)
