@@ -111,7 +111,7 @@ def write_bundle(design: Design, spec_text: str, path: Path, replace: bool = Fal
         if path.exists():
             shutil.rmtree(path)
         draft.rename(path)
-    except BaseException:
+    except BaseException:  # Ctrl-C too: no half-written folder stays
         shutil.rmtree(draft, ignore_errors=True)
         raise
     return open_bundle(path)

@@ -47,7 +47,7 @@ def start(config: BenchConfig, state: Path, only: Sequence[str] = ()) -> dict[st
                 begun[name] = _spawn(name, words(command, state), state)
         for name, process in begun.items():
             running[name] = {"url": _await_ready(name, process, state), "process": process, "began": _began(process)}
-    except BaseException:
+    except BaseException:  # Ctrl-C too: all or none stay running
         for process in begun.values():
             _end(process)
         raise

@@ -202,7 +202,7 @@ class Laser:
         try:
             self.link.ask(f"$J=G91G21X{x_mm:.3f}Y{y_mm:.3f}F{60 * feed_mm_s:.1f}")
             self.wait_until_idle(60.0 + 4 * (abs(x_mm) + abs(y_mm)) / feed_mm_s)
-        except BaseException:
+        except BaseException:  # Ctrl-C too: the head must not go on alone
             self.cancel_jog()
             raise
         self._quiet = True

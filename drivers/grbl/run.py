@@ -184,7 +184,7 @@ def run_program(laser: Laser, lines: Sequence[str], watcher: Watcher) -> Progres
         while not run.stream.done:
             run.step()
         _await_standstill(run)
-    except BaseException:
+    except BaseException:  # Ctrl-C too: the beam is off on every way out
         laser.off()
         raise
     laser.end()

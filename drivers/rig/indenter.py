@@ -363,7 +363,7 @@ def open_indenter(url: str, registers: RegisterMap, hear: Callable[[Sample], Non
     rig = Indenter(bus, registers, hear)
     try:
         rig.identify()
-    except BaseException:
+    except BaseException:  # Ctrl-C too: the line is given back
         bus.close()
         raise
     return rig

@@ -262,7 +262,7 @@ def _compared(here: Workspace, request: Request, specimen: Specimen | None) -> t
     except KeyboardInterrupt:
         run.finish("stopped", "stopped by the operator")
         raise Stopped("stopped") from None
-    except Exception as fault:
+    except Exception as fault:  # whatever it was, the record says how the run ended
         run.finish("refused" if isinstance(fault, RefusedError) else "failed", str(fault))
         raise
     run.finish("refused" if made.exit_code == REFUSED else "done", _sentence(body), verdict=body["verdict"])
