@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fabctl.scan.coarse import distinct, search, search_cloud
 from fabctl.scan.nearest import poses
-from fabctl.scan.similarity import IDENTITY, Similarity, axis_and_angle, rotation_of
+from fabctl.scan.similarity import IDENTITY, Similarity, axis_and_angle, jacobian, rotation_of
 from fabctl.scan.target import Target
 
 Floats = NDArray[np.float64]
@@ -165,8 +165,6 @@ def _self_fits(target: Target, *, mirror: bool) -> list[Symmetry]:
 
 def _polished(motion: Similarity, target: Target, probes: Floats) -> Similarity:
     """Return the motion after exact point-to-plane steps in both directions."""
-    from fabctl.scan.refine import jacobian
-
     size, centre = target.diagonal_mm, target.centre_mm
     for _ in range(POLISH_STEPS):
         rows, rest = [], []
