@@ -16,7 +16,7 @@ from typing import Literal, TypeVar
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout, ProtocolError, TransportError
 from drivers.rig.bus import ExceptionReply, RegisterBus, open_bus
 from drivers.rig.registers import BadReply, RegisterMap, Value
-from drivers.rig.samples import Asked, Freshness, Restarted, Sample
+from drivers.rig.samples import Asked, Freshness, Restarted, Sample, Stale
 
 LOST = (DeviceTimeout, BadReply, ExceptionReply)  # one reply less; the next request may do better
 Guard = Literal["none", "above", "below"]
@@ -145,8 +145,10 @@ class Indenter:
                 self.bus.write(feed.address, fed)
                 words = self.bus.read(status.table, status.address, status.words_count)
             found = self._fresh.believe(words, Asked(self._request, sent_s, self._now_s()))
-        except LOST:
+        except LOST as fault:
             self.lost_count += 1
+            if isinstance(fault, Stale):
+                self.bus.drain()  # another reply is still on its way, and would answer the next request
             raise
         self._number = max(self._number, found.command_id)
         self.hear(found)

@@ -68,6 +68,8 @@ class RegisterMap:
     """A rig's whole map. `faults` names the bits of the fault word from the lowest; `commands` are codes by name.
 
     With `exchange` the heartbeat is written and the status read in one request (function 23); without it in two.
+    `heartbeat_s` is the load cell's time for one conversion, 0 where it is not known: then its heartbeat must only
+    change. `clock_drift_ratio` is by how much the controller's clock may run faster or slower than the host's.
     """
 
     name: str
@@ -84,6 +86,8 @@ class RegisterMap:
     command_states: tuple[str, ...]
     reasons: tuple[str, ...]
     commands: Mapping[str, int] = field(default_factory=dict)
+    heartbeat_s: float = 0.0
+    clock_drift_ratio: float = 5e-4
 
     def decode(self, block: str, words: Sequence[int]) -> dict[str, Value]:
         """Return the block's values in their units; raise `BadReply` where the number of words is wrong."""

@@ -65,6 +65,8 @@ class RigMapConfig(Model):
     tick_s: Annotated[float, Field(gt=0)]
     timeout_s: Annotated[float, Field(gt=0)]
     response_max_s: Annotated[float, Field(gt=0)]
+    heartbeat_s: Annotated[float, Field(ge=0)] = 0.0
+    clock_drift_ratio: Annotated[float, Field(gt=0, lt=0.1)] = 5e-4
     states: tuple[str, ...]
     faults: Annotated[tuple[str, ...], Field(max_length=16)]
     command_states: tuple[str, ...]
@@ -121,6 +123,8 @@ class RigMapConfig(Model):
             command_states=self.command_states,
             reasons=self.reasons,
             commands=dict(self.commands),
+            heartbeat_s=self.heartbeat_s,
+            clock_drift_ratio=self.clock_drift_ratio,
         )
 
 

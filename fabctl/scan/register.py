@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from design.findings import Finding
 from fabctl.events import Emit, Event, silent
+from fabctl.scan.borders import borne_out, circle
 from fabctl.scan.clean import Cleaned, Part
 from fabctl.scan.coarse import search, search_cloud
 from fabctl.scan.judge import Judged, judge, thin
@@ -101,6 +104,11 @@ class Body:
     even: Floats
     dense: Floats
 
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Return the dense points as read, to be asked for neighbours."""
+        return cKDTree(self.dense)
+
 
 def body_of(task: Task, part: Part) -> Body | None:
     """Return the points of the part, or None where there are too few."""
@@ -144,11 +152,26 @@ def _distinct(task: Task, judged: list[Judged]) -> list[Judged]:
 def pushed(task: Task, body: Body, best: Judged) -> list[Judged]:
     """Return where the best pose goes when it is pushed along the motions that the surface hardly holds."""
     weak = weak_motions(best.fit, task.target, task.options, HELD_FRAC)
-    return [
+    near = [
         tried(task, body, moved_by(best.pose, push * motion, task.target), "pushed along a weak motion")
         for motion in weak
         for push in PUSHES_FRAC
     ]
+    turned = [start for motion in weak[:1] for start in circle(body.tree, best.pose, motion, task.target).likeliest()]
+    return near + [tried(task, body, start, "turned until the border fits") for start in turned]
+
+
+def decide_by_border(task: Task, body: Body, candidates: list[Judged]) -> Judged | None:
+    """Return the one candidate that the border does not contradict, if every other turn is contradicted."""
+    said = [borne_out(body.tree, j.pose, task.target) for j in candidates]
+    left = [j for j, s in zip(candidates, said, strict=True) if s is None or not s.contradicted()]
+    if len(left) != 1:
+        return None
+    mine = borne_out(body.tree, left[0].pose, task.target)
+    weak = weak_motions(left[0].fit, task.target, task.options, HELD_FRAC)
+    others = [circle(body.tree, left[0].pose, motion, task.target) for motion in weak]
+    doubt = any(c.open_elsewhere(left[0].pose, task.target) for c in others)
+    return left[0] if mine is not None and mine.free() and not doubt else None
 
 
 def register(task: Task) -> Registration:
@@ -195,6 +218,11 @@ def _decided(task: Task, body: Body, found: list[Judged]) -> Registration:
             others = tuple(j for j in (best, *turned, *rivals) if j.fit.patches is not chosen.fit.patches)
             return _finished(task, "aligned", chosen, others, body, "datum points")
     turns = bool(turned) or task.symmetries.continuous
+    if rivals and not turns:
+        single_out = decide_by_border(task, body, [best, *rivals])
+        if single_out is not None:
+            others = tuple(j for j in (best, *rivals) if j is not single_out)
+            return _finished(task, "aligned", single_out, others, body, "border")
     status: Status = "ambiguous" if rivals else "symmetric" if turns else "aligned"
     return _finished(task, status, best, (*turned, *rivals), body)
 

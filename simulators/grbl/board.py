@@ -21,7 +21,7 @@ TICK_S = 1e-6  # shorter waits are none
 UART_BYTES = 2  # what the receiver's own registers hold while the program is deaf
 REAL_TIME = {0x3F: Asked.STATUS, 0x7E: Asked.START, 0x21: Asked.HOLD, 0x84: Asked.DOOR}
 RESET = 0x18
-MOTION_OVERRIDES, ACCESSORY_OVERRIDES = range(0x90, 0x98), range(0x99, 0xA1)
+MOTION_OVERRIDES, ACCESSORY_OVERRIDES = range(0x90, 0x98), range(0x99, 0xA2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +170,8 @@ class Board:
             m.stepper.start(m.now_s)
         else:
             m.asked |= Asked.CYCLE_DONE
+        if m.memory.on(21):
+            m.watch_switches()
         self._note_beam()
 
     def _note_beam(self) -> None:

@@ -18,6 +18,7 @@ from simulators.grbl.machine import Machine, World
 from simulators.grbl.settings import Memory
 
 LONGEST_WAIT_S = 0.02
+SHORTEST_WAIT_S = 0.0008  # nine bytes of a fast line: looking at each by itself would cost more than all the rest
 Trace = Callable[[Point], None]
 # A laser as a lab has it: 300 × 200 mm, homing at the far corner, laser mode on.
 LAB: dict[int, float] = {
@@ -82,7 +83,11 @@ def _serve(endpoint: PtyEndpoint | TcpEndpoint, options: argparse.Namespace, tra
         if fault is not None:
             out = _spoil(fault, out, now_s, board, endpoint)
         wait_s = min(board.next_event_s(), board.next_output_s()) - clock.now_s()
-        wait_s = min(max(clock.real_s(wait_s), 0.0), LONGEST_WAIT_S) if not math.isnan(wait_s) else LONGEST_WAIT_S
+        wait_s = (
+            min(max(clock.real_s(wait_s), SHORTEST_WAIT_S), LONGEST_WAIT_S)
+            if not math.isnan(wait_s)
+            else LONGEST_WAIT_S
+        )
         data, opened = endpoint.exchange(out, wait_s)
         if opened and options.dtr_reset:
             board.restart()

@@ -189,6 +189,8 @@ def _limit_entry(move: Move, nominal: float, before: float) -> None:
 
 
 def _round(value: float) -> int:
+    if not abs(value) < 2**31:
+        return -(2**31)  # what the firmware's library answers beyond its range
     return math.floor(abs(value) + 0.5) * (1 if value >= 0 else -1)
 
 

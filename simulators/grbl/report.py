@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from simulators.grbl.gcode import FLOOD, MIST
 from simulators.grbl.machine import BUSY, Machine, State, Suspend
 from simulators.grbl.settings import N_SYSTEMS
 from simulators.grbl.words import coordinate, decimals, rate
 
 BANNER = "Grbl 1.1h ['$' for help]"
 HELP = "[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]"
+CHECK_LIMITS = "[MSG:Check Limits]"
 LOCKED = "[MSG:'$H'|'$X' to unlock]"
 BUFFER_BLOCKS, BUFFER_BYTES = 15, 128
 WCO_BUSY, WCO_IDLE, OV_BUSY, OV_IDLE = 30, 10, 20, 10
@@ -26,7 +28,7 @@ def status(m: Machine) -> str:
         fields.append(f"Bf:{BUFFER_BLOCKS - len(m.planner.moves)},{m.rx_free()}")
     speed = m.stepper.speed_mm_s * 60 if m.state in BUSY else 0.0
     fields.append(f"FS:{rate(speed, inches)},{decimals(m.shown_s_count, 0)}")
-    pins = "".join("XYZ"[k] for k in sorted(m.limits_hit()))
+    pins = ("P" if m.probe_triggered() else "") + "".join("XYZ"[k] for k in sorted(m.limits_hit()))
     if pins:
         fields.append(f"Pn:{pins}")
     busy = m.state in BUSY
@@ -41,7 +43,8 @@ def status(m: Machine) -> str:
     else:
         m.ov_count = (OV_BUSY if busy else OV_IDLE) - 1
         fields.append(f"Ov:{m.overrides.feed},{m.overrides.rapid},{m.overrides.spindle}")
-        on = ("" if m.pin.power_frac == 0 else "C" if m.pin.ccw else "S") + ("F" if m.flood else "")
+        on = "" if m.pin.power_frac == 0 else "C" if m.pin.ccw else "S"
+        on += ("F" if m.coolant & FLOOD else "") + ("M" if m.coolant & MIST else "")
         if on:
             fields.append(f"A:{on}")
     return f"<{'|'.join(fields)}>"
@@ -83,7 +86,8 @@ def modes(m: Machine) -> str:
     motion = f"G38.{now.motion % 10}" if now.motion > 380 else f"G{now.motion}"
     feed = rate(p.feed_mm_min, m.memory.on(13))
     words = [motion, f"G{54 + now.system}", f"G{now.plane}", f"G{now.units}", f"G{now.distance}", f"G{now.feed_mode}"]
-    words += [f"M{now.spindle}", f"M{now.coolant}", f"T{p.tool}", f"F{feed}", f"S{decimals(p.s_count, 0)}"]
+    air = [f"M{number}" for number, bit in ((7, MIST), (8, FLOOD)) if now.coolant & bit] or ["M9"]
+    words += [f"M{now.spindle}", *air, f"T{p.tool}", f"F{feed}", f"S{decimals(p.s_count, 0)}"]
     return f"[GC:{' '.join(words)}]"
 
 

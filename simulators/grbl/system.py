@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from simulators.grbl import report
-from simulators.grbl.execute import Status, run_line
+from simulators.grbl.execute import Status, run_line, synchronise
 from simulators.grbl.homing import home
 from simulators.grbl.machine import Asked, Machine, Program, State
 from simulators.grbl.realtime import poll
@@ -24,6 +24,9 @@ def program(m: Machine) -> Program:
 
 
 def _main_loop(m: Machine) -> Program:
+    if m.memory.on(21) and m.limits_hit():
+        m.state = State.ALARM
+        m.say(f"{report.CHECK_LIMITS}\r\n")
     if m.state in (State.ALARM, State.SLEEP):
         m.say(f"{report.LOCKED}\r\n")
         m.state = State.ALARM
@@ -196,6 +199,7 @@ def _store(m: Machine, line: str, startup: bool) -> Status:
     if startup:
         status = yield from run_line(m, line[at + 1 :])
         if status == OK:
+            yield from synchronise(m)
             m.memory.store_startup(int(index), line[at + 1 :])
         return status
     value = read_number(line, at + 1)
