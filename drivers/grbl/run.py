@@ -19,7 +19,7 @@ from drivers.grbl.link import HOLD, START, STATUS, Link, alarm
 from drivers.grbl.messages import Alarm, Banner, Error, Garbled, Message, Ok, Report
 from drivers.grbl.stream import Stream
 
-POLL_S = 0.1
+POLL_S = 0.05  # how old the place may be by which lines are held back
 ASK_AGAIN_S = 0.3
 STALL_S = 0.8
 IDLE_PROOF_S = 0.25  # Idle seen twice so far apart, with lines unanswered: an answer is lost

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass, field, replace
 from enum import Enum, Flag, auto
 
-from simulators.grbl.gcode import Modes, Parser
+from simulators.grbl.modes import Modes, Parser
 from simulators.grbl.planner import Overrides, Planner
 from simulators.grbl.settings import Memory
 from simulators.grbl.stepper import Pin, Stepper

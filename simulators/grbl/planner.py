@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from simulators.grbl.gcode import Vector
+from simulators.grbl.modes import Vector
 from simulators.grbl.settings import Memory
 
 CAPACITY = 15

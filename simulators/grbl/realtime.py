@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from simulators.grbl import report
-from simulators.grbl.gcode import FLOOD, MIST
 from simulators.grbl.machine import (
     ALARM_HARD_LIMIT,
     ALARM_SOFT_LIMIT,
@@ -20,6 +19,7 @@ from simulators.grbl.machine import (
     State,
     Suspend,
 )
+from simulators.grbl.modes import FLOOD, MIST
 
 ALARM_PAUSE_S = 0.5
 DWELL_STEP_S = 0.050

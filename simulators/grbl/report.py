@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from simulators.grbl.gcode import FLOOD, MIST
 from simulators.grbl.machine import BUSY, Machine, State, Suspend
+from simulators.grbl.modes import FLOOD, MIST
 from simulators.grbl.settings import N_SYSTEMS
 from simulators.grbl.words import coordinate, decimals, rate
 
