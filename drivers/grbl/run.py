@@ -124,9 +124,9 @@ class _Run:
             self.idle_since_s = None
         elif isinstance(message, Error):
             index = self.stream.answered()
-            raise LineRefused(index, self.stream.lines[index], message.code, self.stream.sent_count)
+            raise LineRefused(index, self.stream.lines[index], message.code, self.stream.sent_count, self.link.firmware)
         elif isinstance(message, Alarm):
-            raise alarm(message.code)
+            raise alarm(message.code, self.link.firmware)
         elif isinstance(message, Banner):
             raise BoardRestarted(message.text)
         elif isinstance(message, Report):
@@ -140,7 +140,7 @@ class _Run:
         now_s = self.link.clock.now_s()
         self.unanswered_s = None
         if report.state in ("Alarm", "Sleep", "Check"):
-            raise alarm(0)
+            raise alarm(0, self.link.firmware)
         free = report.free_bytes
         if free is not None and self.empty_bytes is not None:
             used = self.empty_bytes - free

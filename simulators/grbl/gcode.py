@@ -41,7 +41,7 @@ class _Words:
     groups: set[str] = field(default_factory=set)
     axis_command: str = ""
     action: str = ""
-    modes: Modes = Modes()
+    modes: Modes = field(default_factory=Modes)
 
     @property
     def axes(self) -> list[int]:

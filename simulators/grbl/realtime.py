@@ -80,6 +80,8 @@ def _raise_alarm(m: Machine) -> Program:
     code = m.alarm
     m.state = State.ALARM
     m.say(f"ALARM:{code}\r\n")
+    if m.dialect.after_alarm:
+        m.say(m.dialect.after_alarm.format(code=code) + "\r\n")
     yield m.now_s + ALARM_PAUSE_S
     if code in (ALARM_HARD_LIMIT, ALARM_SOFT_LIMIT):
         m.say("[MSG:Reset to continue]\r\n")
