@@ -181,6 +181,7 @@ class Indenter:
             "acceleration": limits.acceleration_mm_s2,
             "watchdog": limits.watchdog_s,
         }
+        self._refuse_outside("settings", "limits", values)
         words = self.registers.encode("settings", values)
         block = self.registers.blocks["settings"]
         self._again(lambda: self.bus.write(block.address, words))
@@ -253,6 +254,7 @@ class Indenter:
 
     def _confirmed(self, command: str, once: bool = True, **values: float) -> int:
         """Send a command once and return its number when the status shows it; see the head of this file."""
+        self._refuse_outside("command", command, values)
         if self._number == 0:
             self.fresh_sample()  # the numbers go on from the controller's last one
         for attempt in range(1 if once else 5):
@@ -271,6 +273,11 @@ class Indenter:
                 raise MotionUnknown(command, number, stopped)
             self._sleep(self.registers.response_max_s * attempt)
         raise DeviceTimeout(self.bus.url, f"confirmation of {command}", self.registers.timeout_s * 5)
+
+    def _refuse_outside(self, block: str, command: str, values: Mapping[str, Value]) -> None:
+        """Raise before anything is sent where the map's own limits forbid a value."""
+        if outside := self.registers.outside(block, values):
+            raise DeviceRefused("rig", command, "; ".join(outside), "the limits stand in the rig's map")
 
     def _send(self, command: str, **values: float) -> int:
         """Put the command on the line, once; a lost reply is not an answer either way."""

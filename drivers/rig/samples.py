@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from drivers.rig.registers import BadReply, RegisterMap, check_word
 
-HALF = 2**31
 HEARTBEAT_MODULUS = 2**16
 SLACK_S = 0.02  # two clocks of 100 ppm and the time of a frame on the line, with room
 
@@ -75,6 +74,8 @@ class Freshness:
 
     def __init__(self, registers: RegisterMap) -> None:
         self._map = registers
+        words = next(r.words_count for r in registers.blocks["status"].registers if r.name == "sequence")
+        self._modulus: int = 1 << 16 * words
         self._bounds: ClockBounds | None = None
         self._last: tuple[int, int, Asked] | None = None
         self._elapsed_ticks = 0
@@ -92,6 +93,8 @@ class Freshness:
             raise BadReply(f"status: the block's check {values['check']} does not fit its words")
         if "request_echo" in values and values["request_echo"] != asked.request:
             raise Stale(f"status: answers request {values['request_echo']}, asked was {asked.request}: stale")
+        if outside := self._map.outside("status", values):
+            raise BadReply(f"status: {'; '.join(outside)}")
         self._doubt_a_pause(asked)
         sequence, heartbeat = int(values["sequence"]), int(values.get("heartbeat", -1))
         self._elapsed_ticks += self._advance(sequence, heartbeat, asked)
@@ -124,10 +127,10 @@ class Freshness:
             self._doubted = None
             return 0
         before, beat, last = self._last
-        ticks = (sequence - before) % 2**32
+        ticks = (sequence - before) % self._modulus
         if ticks == 0:
             raise BadReply(f"status: sequence {sequence} was there before: frozen")
-        if ticks >= HALF:
+        if 2 * ticks >= self._modulus:
             self._doubt_a_restart(sequence, asked)
             raise BadReply(f"status: sequence {sequence} after {before}: it ran backwards")
         least_s, most_s = _passed_s(last, asked)
@@ -188,7 +191,7 @@ class Freshness:
         if doubted is None:
             return False
         least_s, most_s = _passed_s(doubted[1], asked)
-        passed_s = ((sequence - doubted[0]) % 2**32) * self._map.tick_s
+        passed_s = ((sequence - doubted[0]) % self._modulus) * self._map.tick_s
         return max(least_s, self._map.tick_s) <= passed_s <= most_s
 
 

@@ -26,7 +26,6 @@ SEEN_RATIO, EMPTY_RATIO = 0.4, 0.15  # of the usual number of points in a ball
 REFUTED, FREE, BORNE_OUT = 0.2, 0.05, 0.5  # shares of a loop
 SPINS = 120
 ANGLES_KEPT = 3
-NEXT_FRAC = 0.04  # of the diagonal; a turn this far on is another pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,15 +93,13 @@ class Circle:
         top = [k for k in range(n) if merit[k] > merit[k - 1] and merit[k] >= merit[(k + 1) % n]]
         return [self.poses[k] for k in sorted(top, key=lambda k: -merit[k])[:ANGLES_KEPT]]
 
-    def open_elsewhere(self, chosen: Similarity, target: Target) -> bool:
-        """Return whether a turn well away from `chosen` is not contradicted either."""
-        points = target.search.grid.points[:200] * target.diagonal_mm + target.centre_mm
-        back = chosen.inverse()(points)
-        for pose, said in zip(self.poses, self.said, strict=True):
-            away = np.sqrt(((pose(back) - points) ** 2).sum(axis=1).mean()) / target.diagonal_mm
-            if away > NEXT_FRAC and (said is None or not said.contradicted()):
-                return True
-        return False
+    def open_elsewhere(self) -> bool:
+        """Return whether a turn apart from the first pose's own stretch is not contradicted either."""
+        refuted = [s is not None and s.contradicted() for s in self.said]
+        if not any(refuted):
+            return bool(self.said)
+        first, last = refuted.index(True), len(refuted) - 1 - refuted[::-1].index(True)
+        return not all(refuted[first : last + 1])
 
 
 def circle(cloud: cKDTree, pose: Similarity, motion: Floats, target: Target) -> Circle:

@@ -21,6 +21,7 @@ FORMATS = (".ply", ".obj", ".stl", ".pcd", ".xyz", ".txt", ".csv", ".las", ".laz
 LEAST_POINTS = 500
 MESH_SAMPLES = 300_000
 MOST_POINTS = 5_000_000
+RGB = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +171,27 @@ def _sampled(mesh: Any, path: Path, seed: int) -> Cloud:
         colours = np.round(255 * mixed).astype(np.uint8)
     said = Finding("SCAN-MESH", f"a mesh of {len(faces)} triangles, sampled evenly by {count} points", level="info")
     return Cloud(points, cross[face] / area[face, None], colours, path, (said,))
+
+
+def read_painted(path: Path) -> tuple[Floats, NDArray[np.uint8] | None]:
+    """Return points and colours of a PLY file, its vertices where it is a mesh; no colours where it has none."""
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
+    o3d = open3d()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        read = o3d.io.read_point_cloud(str(path))
+    colours = np.round(255 * np.array(read.colors)).astype(np.uint8) if read.has_colors() else None
+    return np.array(read.points, dtype=np.float64).reshape(-1, 3), colours
+
+
+def write_painted(path: Path, points_mm: Floats, colours: NDArray[np.uint8]) -> None:
+    """Write points with the colours they were scanned in as binary PLY."""
+    table = np.zeros(len(points_mm), dtype=[(k, "<f4") for k in "xyz"] + [(k, "u1") for k in RGB])
+    table["x"], table["y"], table["z"] = points_mm.T
+    table["red"], table["green"], table["blue"] = colours.T
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property float {k}" for k in "xyz"] + [f"property uchar {k}" for k in RGB]
+    path.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode() + table.tobytes())
 
 
 def read_labelled(path: Path) -> dict[str, Floats]:

@@ -53,7 +53,7 @@ def draw(pieces: Iterator[Piece], most: int, seed: int) -> Drawn:
     held: list[tuple[Floats, Floats, NDArray[np.float32]]] = []
     limit, count, total, lost = 1.0, 0, 0, 0
     for piece in pieces:
-        good = np.isfinite(piece.points).all(axis=1)
+        good = np.asarray(np.isfinite(piece.points).all(axis=1))
         lost += int((~good).sum())
         total += len(good)
         key = rng.random(len(good))

@@ -7,7 +7,7 @@ from collections.abc import Generator
 from dataclasses import replace
 
 from simulators.grbl import report
-from simulators.grbl.gcode import PLANES, Block, Fault, Parser, Vector, parse
+from simulators.grbl.gcode import PLANES, Fault, parse
 from simulators.grbl.machine import (
     ALARM_PROBE_BEFORE,
     ALARM_PROBE_MISSED,
@@ -18,6 +18,7 @@ from simulators.grbl.machine import (
     Program,
     State,
 )
+from simulators.grbl.modes import Block, Parser, Vector
 from simulators.grbl.realtime import DWELL_STEP_S, poll, wake
 from simulators.grbl.settings import G28, G30
 

@@ -7,7 +7,8 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass, field, replace
 from enum import Enum, Flag, auto
 
-from simulators.grbl.gcode import Modes, Parser
+from simulators.grbl.dialects import GRBL, Dialect
+from simulators.grbl.modes import Modes, Parser
 from simulators.grbl.planner import Overrides, Planner
 from simulators.grbl.settings import Memory
 from simulators.grbl.stepper import Pin, Stepper
@@ -97,6 +98,7 @@ class Machine:
     memory: Memory = field(default_factory=Memory)
     world: World = field(default_factory=World)
     options: str = "V"
+    dialect: Dialect = GRBL
     now_s: float = 0.0
     state: State = State.IDLE
     asked: Asked = Asked.NOTHING
@@ -114,6 +116,7 @@ class Machine:
     pin: Pin = field(default_factory=Pin)
     shown_s_count: float = 0.0
     coolant: int = 0
+    homed: bool = False
     switches_seen: set[int] = field(default_factory=set)
     probe_found: bool = False
     probe_steps: tuple[int, int, int] = (0, 0, 0)
@@ -124,7 +127,7 @@ class Machine:
     go_deaf: Callable[[float], None] = lambda until_s: None
 
     def __post_init__(self) -> None:
-        self.planner = Planner(self.memory, self.overrides)
+        self.planner = Planner(self.memory, self.overrides, capacity_count=self.dialect.blocks_count)
         self.stepper = Stepper(self.planner, self.memory, self.pin, self.duty)
         self.planner.notify = self.stepper.look_again
 

@@ -14,6 +14,7 @@ from simulators.clock import Clock
 from simulators.endpoints import PtyEndpoint, TcpEndpoint
 from simulators.faults import KINDS, Fault
 from simulators.grbl.board import Board, Point
+from simulators.grbl.dialects import DIALECTS
 from simulators.grbl.machine import Machine, World
 from simulators.grbl.settings import Memory
 
@@ -68,7 +69,7 @@ def make_machine(options: argparse.Namespace) -> Machine:
     if options.lab:
         world.real_mm = (-40.0, -30.0, -5.0)
         memory.values[132] = 10.0
-    return Machine(memory=memory, world=world, options=options.options)
+    return Machine(memory=memory, world=world, options=options.options, dialect=DIALECTS[options.dialect])
 
 
 def _serve(endpoint: PtyEndpoint | TcpEndpoint, options: argparse.Namespace, trace: Trace | None) -> None:
@@ -140,6 +141,7 @@ def _parse(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--switches", action="store_true", help="connect limit switches")
     parser.add_argument("--set", action="append", metavar="N=VALUE", help="change a setting before power-up")
     parser.add_argument("--options", default="V", help="the build options that $I shows")
+    parser.add_argument("--dialect", choices=sorted(DIALECTS), default="grbl", help="speak as this firmware does")
     parser.add_argument("--dtr-reset", action="store_true", help="restart when a host opens the line")
     parser.add_argument("--fault", choices=KINDS, help="let this fault happen once")
     parser.add_argument("--seed", type=int, default=0, help="seed of the fault's moment")

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from simulators.grbl import report
-from simulators.grbl.gcode import FLOOD, MIST
 from simulators.grbl.machine import (
     ALARM_HARD_LIMIT,
     ALARM_SOFT_LIMIT,
@@ -20,6 +19,7 @@ from simulators.grbl.machine import (
     State,
     Suspend,
 )
+from simulators.grbl.modes import FLOOD, MIST
 
 ALARM_PAUSE_S = 0.5
 DWELL_STEP_S = 0.050
@@ -80,6 +80,8 @@ def _raise_alarm(m: Machine) -> Program:
     code = m.alarm
     m.state = State.ALARM
     m.say(f"ALARM:{code}\r\n")
+    if m.dialect.after_alarm:
+        m.say(m.dialect.after_alarm.format(code=code) + "\r\n")
     yield m.now_s + ALARM_PAUSE_S
     if code in (ALARM_HARD_LIMIT, ALARM_SOFT_LIMIT):
         m.say("[MSG:Reset to continue]\r\n")

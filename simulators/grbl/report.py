@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from simulators.grbl.gcode import FLOOD, MIST
 from simulators.grbl.machine import BUSY, Machine, State, Suspend
+from simulators.grbl.modes import FLOOD, MIST
 from simulators.grbl.settings import N_SYSTEMS
 from simulators.grbl.words import coordinate, decimals, rate
 
-BANNER = "Grbl 1.1h ['$' for help]"
 HELP = "[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]"
 CHECK_LIMITS = "[MSG:Check Limits]"
 LOCKED = "[MSG:'$H'|'$X' to unlock]"
-BUFFER_BLOCKS, BUFFER_BYTES = 15, 128
 WCO_BUSY, WCO_IDLE, OV_BUSY, OV_IDLE = 30, 10, 20, 10
 
 
@@ -25,7 +23,7 @@ def status(m: Machine) -> str:
         name, position = "WPos", _minus(position, offset)
     fields = [_state(m), f"{name}:{_vector(position, inches)}"]
     if mask & 2:
-        fields.append(f"Bf:{BUFFER_BLOCKS - len(m.planner.moves)},{m.rx_free()}")
+        fields.append(f"Bf:{m.dialect.blocks_count - len(m.planner.moves)},{m.rx_free()}")
     speed = m.stepper.speed_mm_s * 60 if m.state in BUSY else 0.0
     fields.append(f"FS:{rate(speed, inches)},{decimals(m.shown_s_count, 0)}")
     pins = ("P" if m.probe_triggered() else "") + "".join("XYZ"[k] for k in sorted(m.limits_hit()))
@@ -38,6 +36,8 @@ def status(m: Machine) -> str:
         m.wco_count = (WCO_BUSY if busy else WCO_IDLE) - 1
         m.ov_count = m.ov_count or 1
         fields.append(f"WCO:{_vector(offset, inches)}")
+        if m.dialect.homed_field and m.memory.on(22):
+            fields.append(f"H:{int(m.homed)}")
     if m.ov_count > 0:
         m.ov_count -= 1
     else:
@@ -93,7 +93,7 @@ def modes(m: Machine) -> str:
 
 def build(m: Machine) -> list[str]:
     """Return the answer to `$I`."""
-    return [f"[VER:1.1h.20190830:{m.memory.build_note}]", f"[OPT:{m.options},{BUFFER_BLOCKS},{BUFFER_BYTES}]"]
+    return [line.format(note=m.memory.build_note, options=m.options) for line in m.dialect.build]
 
 
 def _vector(values: tuple[float, float, float], inches: bool) -> str:

@@ -19,7 +19,9 @@ def program(m: Machine) -> Program:
         m.state = State.ALARM  # with homing on, the position is unknown until homed or unlocked
     while True:
         m.reinitialise()
-        m.say(f"\r\n{report.BANNER}\r\n")
+        for line in m.dialect.before_banner:
+            m.say(f"{line}\r\n")
+        m.say(f"\r\n{m.dialect.banner}\r\n")
         yield from _main_loop(m)
 
 
@@ -43,6 +45,8 @@ def _main_loop(m: Machine) -> Program:
                     return
                 status = OVERFLOW if overflow else (yield from _dispatch(m, line))
                 yield from _deaf_while_writing(m)
+                if status != OK and m.dialect.before_error:
+                    m.say(m.dialect.before_error.format(code=status) + "\r\n")
                 m.say("ok\r\n" if status == OK else f"error:{status}\r\n")
                 line, comment, overflow = "", "", False
             elif comment or overflow:

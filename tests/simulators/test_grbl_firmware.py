@@ -7,8 +7,9 @@ import random
 import pytest
 
 from simulators.grbl.board import Board
-from simulators.grbl.gcode import Fault, Parser, parse
+from simulators.grbl.gcode import Fault, parse
 from simulators.grbl.machine import Machine, State, World
+from simulators.grbl.modes import Parser
 from simulators.grbl.settings import Memory
 from simulators.grbl.words import read_number
 from tests.simulators.test_grbl_board import board, say
@@ -27,7 +28,8 @@ from tests.simulators.test_grbl_board import board, say
         ("G1X1F0", 22), ("G2X1I1F0", 22), ("M6", 20), ("M1M30", 21), ("G93G2X1I1", 22), ("G80", 0), ("M1", 0),
         ("G61", 0), ("G40", 0), ("G49", 0), ("G91.1", 0), ("G4P0", 0), ("G53G0X1", 0), ("N5G0X1", 0), ("G92.1X1", 0),
         ("G43.1Z1", 0), ("G10L2P0X1", 0), ("G3X2Y0R-1F1", 0), ("T255", 0), ("G01X1F1", 0), ("G1X+1F+1", 0), ("F100", 0),
-        ("G53X1G1F1", 0), ("G1.0X1F1", 0), ("M05", 0), ("G0G40G17G21G90G94G54X1", 0), ("G0G49X1", 24), ("G92X1G0Y1", 24),
+        ("G53X1G1F1", 0), ("G1.0X1F1", 0), ("M05", 0), ("G0G40G17G21G90G94G54X1", 0),
+        ("G0G49X1", 24), ("G92X1G0Y1", 24),
     ],
 )  # fmt: skip
 def test_a_line_gets_the_firmware_s_verdict(line: str, code: int) -> None:
@@ -46,7 +48,8 @@ def test_a_line_gets_the_firmware_s_verdict(line: str, code: int) -> None:
         ("$J=G10L2P1X1F1", "error:16"), ("$JX1", "error:3"), ("$J=G20X0.001F10", "ok"), ("$J=G53X0.01F100", "ok"),
         ("$GX", "error:3"), ("$#1", "error:3"), ("$CC", "error:3"), ("$XY", "error:3"), ("$SLPX", "error:3"),
         ("$H", "error:5"), ("$I5", "error:3"), ("$RST=x", "error:3"), ("$RST=$$", "error:3"), ("$33=1", "error:3"),
-        ("$103=1", "error:3"), ("$140=1", "error:3"), ("$300=1", "error:3"), ("$10=-1", "error:4"), ("$-1=5", "error:3"),
+        ("$103=1", "error:3"), ("$140=1", "error:3"), ("$300=1", "error:3"), ("$10=-1", "error:4"),
+        ("$-1=5", "error:3"),
         ("$0=2", "error:6"), ("$0=3", "ok"), ("$20=1", "error:10"), ("$10=1x", "error:3"), ("$10", "error:3"),
         ("$10=", "error:2"), ("$=1", "error:2"), ("$N2=G0", "ok"), ("$N0=G99", "error:20"), ("$N0", "error:3"),
         ("$N=G0", "error:2"), ("$110=0.5", "ok"), ("$26=300", "ok"),
