@@ -90,7 +90,7 @@ def _processes(jobs: int) -> int:
     """Return how many processes work, each with one thread.
 
     The matrices of a cell are too small to share: on a busy machine two threads of BLAS cost a column 5.5 s of
-    processor time, one costs 3.2 s. Called before NumPy is loaded, which reads these once; joblib's workers inherit them.
+    processor time, one costs 3.2 s. Called before NumPy is loaded, which reads these once; workers inherit them.
     """
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
