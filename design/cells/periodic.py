@@ -7,6 +7,7 @@ and the place to ask whether a state is stable against what the sector cannot do
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -196,9 +197,16 @@ class Curve:
     converged: NDArray[np.bool_]
 
 
-def uniaxial_curve(cell: PeriodicCell, reach_ratio: float, points_count: int = 40) -> Curve:
-    """Return E*(ε) from rest to F00 = `reach_ratio`, each state started from the one before."""
-    F00 = np.linspace(1.0, reach_ratio, points_count)
+def uniaxial_curve(
+    cell: PeriodicCell, reach_ratio: float, points_count: int = 60, known: Sequence[tuple[Array, float]] = ()
+) -> Curve:
+    """Return E*(ε) from rest to F00 = `reach_ratio`, each state started from the one before.
+
+    `known` are even states (positions, stretch) on the path, which are taken up as they are: just past the saddle most
+    cells snap sideways (F11 jumps), so the peak must be a root and not the highest of the points.
+    """
+    roots = {s_ratio: position for position, s_ratio in known}
+    F00 = np.union1d(np.linspace(1.0, reach_ratio, points_count), list(roots))
     position, F = cell.rest_mm, np.eye(2)
     before: tuple[Array, Array] | None = None
     rows, good = [], []
@@ -206,6 +214,8 @@ def uniaxial_curve(cell: PeriodicCell, reach_ratio: float, points_count: int = 4
         start_p, start_F = position, F
         if before is not None:
             start_p, start_F = 2 * position - before[0], 2 * F - before[1]
+        if value in roots:
+            start_p, start_F = roots[value], value * np.eye(2)
         start_F = start_F.copy()
         start_F[0, 0] = value
         if not np.isfinite(cell.energy_mm2(start_p, start_F)):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from design.cells.states import CellStates
 
 Array = NDArray[np.float64]
+MAP_COUNT = 240  # points of a drawn map each way: a quarter of a degree
 
 
 def _figure(width_in: float, height_in: float) -> Figure:
@@ -33,28 +34,35 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def maps(library: CellLibrary) -> Figure:
-    """Return the four maps: expansion, barrier, stiffness and tangent Poisson ratio."""
+    """Return the four maps: expansion, barrier, stiffness and tangent Poisson ratio, read between the columns too."""
     figure = _figure(11, 8)
+    t_mm = np.linspace(library.t_mm.min(), library.t_mm.max(), MAP_COUNT)
+    theta = np.linspace(library.theta_rad.min(), library.theta_rad.max(), MAP_COUNT)
+    cells = library.at(t_mm[None, :], theta[:, None])
     fields = (
-        ("expansion 1 + ε", library.expansion_ratio),
-        ("barrier, mJ per cell", library.barrier_mJ),
-        ("stiffness d²E*/dε², mJ per cell", library.stiffness_mJ),
-        ("tangent Poisson ratio", library.nu_tangent_ratio),
+        ("expansion 1 + ε", cells.expansion_ratio),
+        ("barrier, mJ per cell", cells.barrier_mJ),
+        ("stiffness d²E*/dε², mJ per cell", cells.stiffness_mJ),
+        ("tangent Poisson ratio", cells.nu_tangent_ratio),
     )
     for axes, (title, values) in zip(figure.subplots(2, 2).flat, fields, strict=True):
-        drawn = axes.scatter(library.t_mm, np.degrees(library.theta_rad), c=values, s=5, marker="s", linewidths=0)
+        drawn = axes.pcolormesh(t_mm, np.degrees(theta), values, shading="nearest", rasterized=True)
         figure.colorbar(drawn, ax=axes)
         axes.set(title=title, xlabel="t, mm", ylabel="θ, °")
     return figure
 
 
-def energy(curve: Curve, scale_mJ: float, title: str) -> Figure:
-    """Return energy and force of one cell against its uniaxial stretch."""
+def energy(curve: Curve, states_ratio: tuple[float, float], scale_mJ: float, title: str) -> Figure:
+    """Return energy and force of one cell against its uniaxial stretch, saddle and second stable state marked."""
     figure = _figure(9, 4)
     left, right = figure.subplots(1, 2)
-    left.plot(curve.F00_ratio, curve.energy_mm2 * scale_mJ)
+    marks = np.searchsorted(curve.F00_ratio, states_ratio)
+    for axes, values in ((left, curve.energy_mm2 * scale_mJ), (right, curve.force_mm2 * scale_mJ)):
+        axes.plot(curve.F00_ratio, values)
+        axes.plot(curve.F00_ratio[marks], values[marks], "o", color="#b5482f", markersize=4)
+        for mark, name in zip(marks, ("saddle", "second state"), strict=True):
+            axes.annotate(name, (curve.F00_ratio[mark], values[mark]), (4, 4), textcoords="offset points", fontsize=8)
     left.set(title=title, xlabel="1 + ε", ylabel="E*, mJ per cell")
-    right.plot(curve.F00_ratio, curve.force_mm2 * scale_mJ)
     right.axhline(0, color="0.6", linewidth=0.8)
     right.set(xlabel="1 + ε", ylabel="dE*/dε, mJ per cell")
     return figure

@@ -13,7 +13,15 @@ from design.cells import kernels
 from design.cells.elements import THREE_POINTS, gradients
 from design.cells.homogenise import Pair, solve_cell, solve_pair
 from design.cells.mesh import REFERENCE, topology
-from design.cells.periodic import derivatives, equilibrium, factored, periodic_cell, positions, smallest_eigenvalues
+from design.cells.periodic import (
+    derivatives,
+    equilibrium,
+    factored,
+    periodic_cell,
+    positions,
+    smallest_eigenvalues,
+    uniaxial_curve,
+)
 from design.cells.sector import Model, model, raw_tangent, relax
 from design.cells.sheet import Sheet
 from design.cells.tangent import moduli
@@ -152,6 +160,26 @@ def test_released_near_P5_the_cell_returns_to_an_even_expansion(solved: tuple[Mo
     found = equilibrium(cell, place + push, np.array([[s + 0.004, 0.003], [0.003, s - 0.004]]), free=(0, 1, 2))
     assert found.converged
     np.testing.assert_allclose(found.F, s * np.eye(2), atol=1e-7)
+
+
+@pytest.mark.parametrize("points", [24, 60])
+def test_the_uniaxial_path_climbs_to_the_saddle_and_rests_in_the_second_state(
+    solved: tuple[Model, Pair], points: int
+) -> None:
+    m, pair = solved
+    states, cell = (pair.saddle, pair.stable), periodic_cell(m)
+    through = [state.s_ratio for state in states]
+    known = [(positions(cell, m, m.nodes(state.y, state.s_ratio), state.s_ratio), state.s_ratio) for state in states]
+    curve = uniaxial_curve(cell, through[1] + 0.01, points, known)
+    assert curve.converged.all()
+    for state, k in zip(states, np.searchsorted(curve.F00_ratio, through), strict=True):
+        assert curve.energy_mm2[k] == pytest.approx(18 * state.energy_mm2, rel=1e-7)
+        assert curve.F11_ratio[k] == pytest.approx(state.s_ratio, abs=1e-5)
+        assert curve.force_mm2[k] == pytest.approx(0, abs=1e-4)
+    assert curve.energy_mm2.argmax() == np.searchsorted(curve.F00_ratio, through[0])
+    climb = curve.F00_ratio < 1.2
+    work = np.sum(np.diff(curve.F00_ratio[climb]) * (curve.force_mm2[climb][1:] + curve.force_mm2[climb][:-1]) / 2)
+    assert work == pytest.approx(curve.energy_mm2[climb][-1], rel=0.01)  # the force is the energy's slope
 
 
 def test_P5_is_stable_in_the_two_by_two_cell(solved: tuple[Model, Pair]) -> None:
