@@ -89,9 +89,10 @@ class Slot:
             return lambda _x, _y: APEX
 
     def weigh(self, device: Controller) -> None:
-        """Put the mass that lies in the slot on the load cell."""
+        """Put the mass that lies in the slot on the load cell; a file `estop` there is the button, pressed."""
         mass = self._path("mass_kg.txt")
         device.hung_N = read_mass_kg(mass) * GRAVITY_N_KG if mass is not None else 0.0
+        device.estop_open = self._path("estop") is not None
 
     def _path(self, name: str) -> Path | None:
         return self._folder / name if self._folder is not None and (self._folder / name).is_file() else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -74,6 +75,29 @@ def test_mbpoll_reads_the_simulator(tmp_path: Path) -> None:
 def test_a_wrong_unit_id_is_a_timeout_that_says_what_to_check() -> None:
     with simulated_rig("--tcp", "0") as url, pytest.raises(DeviceTimeout, match="unit id"):
         open_indenter(url.replace("unit=1", "unit=9"), PATIENT)
+
+
+def test_the_emergency_stop_stops_the_stage_and_stays_until_it_is_released(tmp_path: Path) -> None:
+    with (
+        simulated_rig("--tcp", "0", "--slot", str(tmp_path), "--specimen", "linear") as url,
+        contextlib.closing(open_indenter(url, PATIENT)) as rig,
+    ):
+        rig.set_limits(LIMITS)
+        rig.arm()
+        rig.wait(rig.home(10.0), 20.0)
+        number = rig.move(4.0, 1.0)
+        (tmp_path / "estop").touch()
+        with pytest.raises(RigFaulted, match="estop"):
+            rig.wait(number, 20.0)
+        assert rig.fresh_sample().position_mm < 3.5
+        rig.clear_faults()
+        with pytest.raises(DeviceRefused, match="faulted"):
+            rig.arm()
+        (tmp_path / "estop").unlink()
+        time.sleep(0.3)
+        rig.clear_faults()
+        rig.arm()
+        assert rig.stop()
 
 
 def test_nobody_there_is_a_transport_error() -> None:
