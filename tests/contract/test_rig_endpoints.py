@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import subprocess
 import time
@@ -108,6 +109,25 @@ def test_nobody_there_is_a_transport_error() -> None:
 def test_a_missing_serial_port_is_named(tmp_path: Path) -> None:
     with pytest.raises(TransportError, match="No such file"):
         open_indenter(f"modbus-rtu://{tmp_path}/none?unit=1", PATIENT)
+
+
+def test_a_host_held_up_while_it_writes_has_not_lost_its_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        simulated_rig("--rtu", str(tmp_path / "rig"), "--specimen", "linear") as url,
+        contextlib.closing(open_indenter(url, PATIENT)) as rig,
+    ):
+        plain = os.write
+
+        def held_up(handle: int, data: bytes) -> int:
+            written = plain(handle, data)
+            time.sleep(0.45)  # longer than the time for a reply
+            return written
+
+        monkeypatch.setattr(os, "write", held_up)
+        with contextlib.suppress(DeviceTimeout, ProtocolError):
+            rig.sample()
+        monkeypatch.undo()
+        assert rig.fresh_sample().sequence > 0
 
 
 def test_another_device_is_not_taken_for_a_rig() -> None:
