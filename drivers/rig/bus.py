@@ -20,6 +20,8 @@ from drivers.rig.registers import BadReply, Table
 # pymodbus logs what it also raises; said once, by us, is enough.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
+WRITE_TIMEOUT_S = 1.0  # a request is some thirty bytes: three milliseconds on the slowest line that keeps a rate
+
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal data address",
@@ -187,6 +189,9 @@ def open_bus(url: str, timeout_s: float, response_max_s: float) -> ModbusBus:
         _probe(url, parts.path)
     if not client.connect():
         raise TransportError(url, "cannot be opened", "check the address, the cable and who else uses the port")
+    if serial_line:
+        # pyserial calls a write that took longer a broken line, though its bytes are out: a host that was held up.
+        client.socket.write_timeout = max(timeout_s, WRITE_TIMEOUT_S)
     # By default pymodbus hangs up after a few lost replies; here the caller decides.
     client.set_max_no_responses(2**31)
     return ModbusBus(url, client, unit, timeout_s, response_max_s, serial_line)

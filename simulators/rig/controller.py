@@ -13,9 +13,10 @@ from typing import Any
 from simulators.rig import registers as R
 from simulators.rig.axis import Axis
 from simulators.rig.loadcell import LoadCell
-from simulators.specimens.curve import Specimen
+from simulators.specimens.curve import Place, Specimen
 
 TICK_S = 0.001
+APEX = Place(0.0, 1.0)  # a surface that is the same everywhere
 OVERLOAD_ROOM = 0.5  # of what an overload exceeds its limit by: noise on the way out must not latch it again
 
 
@@ -47,6 +48,7 @@ class Controller:
     seed: int = 0
     tell: Callable[[str, dict[str, Any]], None] = lambda _kind, _facts: None
     on_arm: Callable[[Controller], None] = lambda _: None
+    place: Callable[[float, float], Place | None] = lambda _x, _y: APEX
     hung_N: float = 0.0
     tick_count: int = 0
     true_N: float = 0.0
@@ -68,6 +70,7 @@ class Controller:
         self.cell = LoadCell(m.capacity_N, m.gain_ratio, m.zero_N, m.drift_N_s, m.wander_N_sqrt_s, m.noise_N, rng)
         self.stage_mm = [0.0, 0.0]
         self._stage_to_mm = [0.0, 0.0]
+        self._under: Place | None = APEX
         self.settings: dict[str, float] = {
             "force_max": 0.9 * m.capacity_N,
             "force_min": -5.0,
@@ -99,11 +102,13 @@ class Controller:
             self._state = R.READY
 
     def _load(self) -> None:
-        if self.specimen is not None:
-            tool_mm = self.axis.tool_mm - self.machine.contact_mm
-            self.depth_mm, force_N = self.specimen.push(tool_mm, self.machine.compliance_mm_N, TICK_S)
+        tool_mm = self.axis.tool_mm - self.machine.contact_mm
+        if self.specimen is not None and self._under is not None:
+            lean, tool_mm = self._under.lean_ratio, tool_mm - self._under.drop_mm
+            into_mm, along_N = self.specimen.push(tool_mm * lean, self.machine.compliance_mm_N * lean**2, TICK_S)
+            self.depth_mm, force_N = into_mm / lean, along_N * lean
         else:
-            self.depth_mm, force_N = self.axis.tool_mm - self.machine.contact_mm, 0.0
+            self.depth_mm, force_N = tool_mm, 0.0
         self.true_N = force_N + self.hung_N
         self.cell.tick(TICK_S)
         self._shown_N, saturated = self.cell.convert(self.true_N)
@@ -164,6 +169,14 @@ class Controller:
         for k in (0, 1):
             left = self._stage_to_mm[k] - self.stage_mm[k]
             self.stage_mm[k] = self._stage_to_mm[k] if abs(left) <= step else self.stage_mm[k] + step * (left > 0 or -1)
+        if self._stage_to_mm == self.stage_mm:
+            self.look_under()
+
+    def look_under(self) -> None:
+        """Take the place under the indenter anew: what was pressed elsewhere has left no trace here."""
+        self._under = self.place(*self.stage_mm)
+        if self.specimen is not None:
+            self.specimen = self.specimen.fresh()
 
     def _fault(self, bit: int) -> None:
         self.axis.brake()

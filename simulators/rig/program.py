@@ -10,15 +10,17 @@ import random
 import signal
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from simulators.rig.controller import Controller, Machine
+from simulators.rig.controller import APEX, Controller, Machine
 from simulators.rig.faults import ENDINGS, KINDS, FaultyLine
 from simulators.rig.server import Pace, Server
 from simulators.specimens.analytic import BY_NAME
-from simulators.specimens.curve import Curves, Specimen
+from simulators.specimens.curve import Curves, Place, Specimen
+from simulators.specimens.relief import ReliefError, read_relief
 from simulators.specimens.slot import SlotError, read_mass_kg, read_response
 
 GRAVITY_N_KG = 9.80665
@@ -71,12 +73,26 @@ class Slot:
         if curves is None and self._words.specimen:
             curves = BY_NAME[self._words.specimen]()
         device.specimen = specimen_of(curves, self._words) if curves else None
+        device.place = self._relief(response)
+        device.look_under()
         self._truth.key(answer_key(device, curves, str(response or self._words.specimen), self._words.loss))
 
+    def _relief(self, response: Path | None) -> Callable[[float, float], Place | None]:
+        """Return how the surface lies at other places; flat where the slot holds no mesh that can be read."""
+        mesh = self._path("deployed.ply")
+        if mesh is None or response is None:
+            return lambda _x, _y: APEX
+        try:
+            return read_relief(mesh, response).at
+        except ReliefError as fault:
+            print(f"rig: {fault}; every place answers as the apex", file=sys.stderr, flush=True)
+            return lambda _x, _y: APEX
+
     def weigh(self, device: Controller) -> None:
-        """Put the mass that lies in the slot on the load cell."""
+        """Put the mass that lies in the slot on the load cell; a file `estop` there is the button, pressed."""
         mass = self._path("mass_kg.txt")
         device.hung_N = read_mass_kg(mass) * GRAVITY_N_KG if mass is not None else 0.0
+        device.estop_open = self._path("estop") is not None
 
     def _path(self, name: str) -> Path | None:
         return self._folder / name if self._folder is not None and (self._folder / name).is_file() else None

@@ -25,6 +25,14 @@ class Curves:
         return self.step_mm * (len(self.load_N) - 1)
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where the indenter meets a specimen: `drop_mm` further down than at its apex, and the cosine of its lean."""
+
+    drop_mm: float
+    lean_ratio: float
+
+
 @dataclass
 class Specimen:
     """Curves with a memory.
@@ -45,6 +53,10 @@ class Specimen:
     _loading: float = field(default=0.0, repr=False)
     _deepest_mm: float = field(default=0.0, repr=False)
     _relaxed_N: float = field(default=0.0, repr=False)
+
+    def fresh(self) -> Specimen:
+        """Return the same specimen as if it had never been pressed."""
+        return Specimen(self.curves, self.blend_mm, self.virgin_ratio, self.virgin_mm, self.creep_ratio, self.creep_s)
 
     def push(self, tool_mm: float, compliance_mm_N: float, dt_s: float) -> tuple[float, float]:
         """Return (depth, force) with the tool at `tool_mm` below first contact, after `dt_s` more."""

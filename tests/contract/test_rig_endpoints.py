@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -76,6 +78,29 @@ def test_a_wrong_unit_id_is_a_timeout_that_says_what_to_check() -> None:
         open_indenter(url.replace("unit=1", "unit=9"), PATIENT)
 
 
+def test_the_emergency_stop_stops_the_stage_and_stays_until_it_is_released(tmp_path: Path) -> None:
+    with (
+        simulated_rig("--tcp", "0", "--slot", str(tmp_path), "--specimen", "linear") as url,
+        contextlib.closing(open_indenter(url, PATIENT)) as rig,
+    ):
+        rig.set_limits(LIMITS)
+        rig.arm()
+        rig.wait(rig.home(10.0), 20.0)
+        number = rig.move(4.0, 1.0)
+        (tmp_path / "estop").touch()
+        with pytest.raises(RigFaulted, match="estop"):
+            rig.wait(number, 20.0)
+        assert rig.fresh_sample().position_mm < 3.5
+        rig.clear_faults()
+        with pytest.raises(DeviceRefused, match="faulted"):
+            rig.arm()
+        (tmp_path / "estop").unlink()
+        time.sleep(0.3)
+        rig.clear_faults()
+        rig.arm()
+        assert rig.stop()
+
+
 def test_nobody_there_is_a_transport_error() -> None:
     with pytest.raises(TransportError, match="cannot be opened"):
         open_indenter(f"modbus-tcp://127.0.0.1:{free_port()}?unit=1", PATIENT)
@@ -84,6 +109,25 @@ def test_nobody_there_is_a_transport_error() -> None:
 def test_a_missing_serial_port_is_named(tmp_path: Path) -> None:
     with pytest.raises(TransportError, match="No such file"):
         open_indenter(f"modbus-rtu://{tmp_path}/none?unit=1", PATIENT)
+
+
+def test_a_host_held_up_while_it_writes_has_not_lost_its_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        simulated_rig("--rtu", str(tmp_path / "rig"), "--specimen", "linear") as url,
+        contextlib.closing(open_indenter(url, PATIENT)) as rig,
+    ):
+        plain = os.write
+
+        def held_up(handle: int, data: bytes) -> int:
+            written = plain(handle, data)
+            time.sleep(0.45)  # longer than the time for a reply
+            return written
+
+        monkeypatch.setattr(os, "write", held_up)
+        with contextlib.suppress(DeviceTimeout, ProtocolError):
+            rig.sample()
+        monkeypatch.undo()
+        assert rig.fresh_sample().sequence > 0
 
 
 def test_another_device_is_not_taken_for_a_rig() -> None:
