@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, cast
 
 import click
 
@@ -56,11 +57,15 @@ def build(
 @click.argument("target")
 @click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell [the material's].")
+@click.option("--cells", type=click.Choice(["expanding", "contracting"]), default="expanding", show_default=True,
+              help="Kind of cells, where TARGET is no specification.")  # fmt: skip
 @click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]), default="none", show_default=True,
               help="What to try where no single sheet fits.")  # fmt: skip
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG of where the surface does not fit.")
 @json_option
-def check(target: str, material: str, cell_mm: float | None, remedy: str, picture: Path | None, as_json: bool) -> None:
+def check(
+    target: str, material: str, cell_mm: float | None, cells: str, remedy: str, picture: Path | None, as_json: bool
+) -> None:
     """Say whether a sheet can become TARGET: a mesh file, a specification, or one of the project's own surfaces."""
     from design.checking import check as checked
     from design.checking import misfit_png
@@ -68,7 +73,7 @@ def check(target: str, material: str, cell_mm: float | None, remedy: str, pictur
     from fabctl.errors import DONE, REFUSED
 
     listen = progress()
-    inputs = inputs_for(target, material, lab().root, cell_mm)
+    inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells))
 
     def watch(message: str, done_frac: float) -> None:
         listen(Event("progress", message, done_frac))
@@ -90,8 +95,8 @@ def check(target: str, material: str, cell_mm: float | None, remedy: str, pictur
     if found.design is not None:
         width, height = found.design.drawing.size_mm
         minutes = found.design.job.time_s / 60
-        cells = len(found.design.cells.wanted_ratio)
-        lines.append(f"the sheet: {cells} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
+        count = len(found.design.cells.wanted_ratio)
+        lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
     show({"target": target, "fits": fits, **found.as_dict()}, as_json, lines)
