@@ -20,6 +20,7 @@ from design.flatten import Flattening, Limits, feasibility, flatten
 from design.flatten.ladder import Remedy
 from design.hinged import Widening, as_cut, hinged, widening
 from design.job import Job, JobOptions, compose_job
+from design.limits import check_count
 from design.pattern.assign import averaged, factor
 from design.pattern.border import framed, piece_of
 from design.pattern.cuts import Cuts, notched
@@ -245,6 +246,7 @@ def scaled(
     if first[1] / first[0] > high / low:
         raise OutOfLibrary(*first, (low, high), found)
     flat = flat.scaled(1 / factor(*first, room, spec.scale))
+    check_count(flat, spec.cell_mm, found)
     if period_mm(flat) is not None:
         return scaled_tube(spec, flat, (low, high), found)
     place = Place()
