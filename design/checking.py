@@ -16,7 +16,7 @@ from design.findings import Finding
 from design.flatten import FeasibilityReport, Limits, feasibility
 from design.flatten.ladder import Remedy
 from design.pattern.paths import Layer, LayerPreset
-from design.pipeline import Design, Watch, build, unwatched
+from design.pipeline import Design, Watch, build, cells_on_offer, unwatched
 from design.spec import DesignSpec
 from design.surface import TriMesh, boundary_loops
 
@@ -57,7 +57,8 @@ def check(
 
     `remedy` (`cones`, `nearest` or `both`) is tried where no single cone-free sheet fits.
     """
-    low, high = selection_curve(library, spec.selection).range_ratio()
+    curve = cells_on_offer(spec, library)[2] or selection_curve(library)
+    low, high = curve.range_ratio()
     limits = Limits(low, high, spec.cell_mm)
     report = feasibility(mesh, limits, spec.flatten, cast(Remedy, remedy), lambda done, text: watch(text, 0.6 * done))
     found = list(report.findings)

@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from design.cells.contracting import at_cells, openings
 from design.cells.library import CellLibrary
 from design.cells.monostable import monostable_cells
 from design.cells.select import Choice, SelectionCurve, on_curve, select, selection_curve
@@ -17,14 +18,18 @@ from design.errors import OutOfLibrary
 from design.findings import Finding
 from design.flatten import Flattening, Limits, feasibility, flatten
 from design.flatten.ladder import Remedy
+from design.hinged import Widening, as_cut, hinged, widening
 from design.job import Job, JobOptions, compose_job
+from design.limits import check_count
 from design.pattern.assign import averaged, factor
 from design.pattern.border import framed, piece_of
+from design.pattern.cuts import Cuts, notched
 from design.pattern.drawing import Drawing
+from design.pattern.holes import holes_of
 from design.pattern.paths import Layer, LayerPreset
 from design.pattern.seams import Pair, label_paths, seam_pairs
 from design.pattern.sheets import Split, fits, split
-from design.pattern.slits import hinge_widths_mm, outline_loops, slit_paths, slits_of
+from design.pattern.slits import hinge_widths_mm, outline_loops, slits_of
 from design.pattern.tiling import Array, Place, Tiling, best_place, tile
 from design.pattern.tubes import period_mm, tile_tube
 from design.predicted import Predicted, predict
@@ -33,6 +38,9 @@ from design.surface import TriMesh
 
 SCALE_ROUNDS_COUNT = 24
 SCALE_MARGIN_RATIO = 2e-4  # kept from the end of the library, so that cells come to lie just inside it
+CONTACT_FRAC = 1e-4  # of the material lying on other material: less is rounding
+HINGE_SAME_MM = 1e-6
+WIDENING_ROUNDS_COUNT, WIDENING_SAME_RATIO = 4, 1e-3  # 1e-3 of expansion moves a hinge by a micrometre
 PUBLISHED_HIGH_RATIO = 1.75  # what the published pipeline scales the greatest expansion to
 
 Watch = Callable[[str, float], None]
@@ -101,11 +109,15 @@ def build(
     """
     watch("flattening the surface", 0.0)
     found = list(findings)
-    curve = None if spec.selection.rule == "published" else selection_curve(library, spec.selection)
+    base, library, curve, wide = cells_on_offer(spec, library)
     flat = lay_flat(spec, mesh, curve, found)
     watch("choosing cells", 0.2)
-    placed, tiling, wanted, choice = choose(spec, flat, library, curve, found)
-    hinge = hinge_widths_mm(choice.expansion_ratio, spec.hinge)
+    placed, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)
+    hinge = hinges_mm(spec, choice, library)
+    if curve is None and np.abs(hinge - base.sheet.hinge_mm).max() > HINGE_SAME_MM:
+        choice, changed = as_cut(base, choice, hinge)
+        found += changed
+    found += contact_findings(spec, choice, library)
     watch("drawing slits", 0.4)
     cells = with_monostable(Cells(tiling, wanted, choice, hinge, kinds_of(spec, tiling)), library, found)
     drawing, shift, labelled, parted = draw(spec, cells, library.sheet, placed)
@@ -124,7 +136,47 @@ def build(
         watch("deploying the sheet", 0.6)
         predicted = predict(placed, cells.tiling, choice, cells.bistable(), library, spec.response, watch)
         found += predicted.findings
-    return Design(spec, library.sheet, mesh, placed, cells, drawing, job, predicted, tuple(found), library.hash, sheets)
+    return Design(spec, base.sheet, mesh, placed, cells, drawing, job, predicted, tuple(found), library.hash, sheets)
+
+
+def cells_on_offer(
+    spec: DesignSpec, library: CellLibrary
+) -> tuple[CellLibrary, CellLibrary, SelectionCurve | None, Widening | None]:
+    """Return the library as given and for the design's hinges, the curve of cells, and what a widening hinge needs.
+
+    The published rule has no curve: it takes the library's own entries, whatever the hinge.
+    """
+    if spec.cells == "contracting":
+        return library, library, selection_curve(library, spec.selection), None
+    if spec.hinge.rule == "constant" and abs(spec.hinge.width_mm - library.sheet.hinge_mm) < HINGE_SAME_MM:
+        curve = None if spec.selection.rule == "published" else selection_curve(library, spec.selection)
+        return library, library, curve, None
+    cut = hinged(library, spec.hinge)
+    if spec.selection.rule == "published":
+        return library, cut, None, None
+    if spec.hinge.rule == "constant":
+        return library, cut, selection_curve(cut, spec.selection), None
+    wide = widening(library, spec.hinge, spec.selection)
+    return library, cut, wide.curve(), wide
+
+
+def hinges_mm(spec: DesignSpec, choice: Choice, library: CellLibrary) -> Array:
+    """Return the hinge of every cell `(k,)`; a contracting cell's is the slit cell's, drawn smaller with its unit."""
+    if spec.cells == "expanding":
+        return hinge_widths_mm(choice.expansion_ratio, spec.hinge)
+    return library.sheet.hinge_mm / at_cells(library, "open_ratio", choice.t_mm, choice.theta_rad)
+
+
+def contact_findings(spec: DesignSpec, choice: Choice, library: CellLibrary) -> list[Finding]:
+    """Return whether contracting cells would lie on themselves once they have closed."""
+    if spec.cells == "expanding":
+        return []
+    overlap = at_cells(library, "overlap_frac", choice.t_mm, choice.theta_rad)
+    touching = int((overlap > CONTACT_FRAC).sum())
+    if not touching:
+        return [Finding("CELLS-CONTACT", "no contracting cell touches itself when it has closed", "info")]
+    text = f"{touching} cells lie on themselves when closed, {overlap.max():.1%} of the material at worst"
+    return [Finding("CELLS-CONTACT", f"{text}; they will close less than predicted", "warning")]
 
 
 def lay_flat(spec: DesignSpec, mesh: TriMesh, curve: SelectionCurve | None, found: list[Finding]) -> Flattening:
@@ -150,7 +202,12 @@ def lay_flat(spec: DesignSpec, mesh: TriMesh, curve: SelectionCurve | None, foun
 
 
 def choose(
-    spec: DesignSpec, flat: Flattening, library: CellLibrary, curve: SelectionCurve | None, found: list[Finding]
+    spec: DesignSpec,
+    flat: Flattening,
+    library: CellLibrary,
+    curve: SelectionCurve | None,
+    found: list[Finding],
+    wide: Widening | None = None,
 ) -> tuple[Flattening, Tiling, Array, Choice]:
     """Return the flat in its final scale and place, its cells, what they must expand by, and the cells chosen."""
     if curve is None:
@@ -163,8 +220,16 @@ def choose(
                     hint="the deployed sheet has not the target's size; take another selection rule for that")
         )  # fmt: skip
         return flat, tiling, wanted, choice
-    flat, tiling, wanted = scaled(spec, flat, curve, found)
-    return flat, tiling, wanted, on_curve(curve, wanted)
+    placed, tiling, wanted = scaled(spec, flat, curve, found)
+    for _ in range(WIDENING_ROUNDS_COUNT if wide is not None else 0):
+        assert wide is not None
+        span = float(wanted.min()), float(wanted.max())
+        curve = wide.curve(span)
+        again: list[Finding] = []
+        placed, tiling, wanted = scaled(spec, flat, curve, again)
+        if max(abs(wanted.min() - span[0]), abs(wanted.max() - span[1])) < WIDENING_SAME_RATIO:
+            break
+    return placed, tiling, wanted, on_curve(curve, wanted)
 
 
 def scaled(
@@ -181,6 +246,7 @@ def scaled(
     if first[1] / first[0] > high / low:
         raise OutOfLibrary(*first, (low, high), found)
     flat = flat.scaled(1 / factor(*first, room, spec.scale))
+    check_count(flat, spec.cell_mm, found)
     if period_mm(flat) is not None:
         return scaled_tube(spec, flat, (low, high), found)
     place = Place()
@@ -310,13 +376,18 @@ def draw(
     Where it is larger than the bed, also how it is split over sheets, if it can be.
     """
     tiling, choice, cut = cells.tiling, cells.choice, cells.cut()
-    slits = slits_of(tiling, choice.t_mm, choice.theta_rad, cells.hinge_mm, sheet.slit_mm, cut)
-    paths = slit_paths(tiling, slits, cut)
+    cuts: Cuts
+    if spec.cells == "contracting":
+        cuts = holes_of(tiling, openings(choice.t_mm, choice.theta_rad, sheet), cut)
+    else:
+        cuts = slits_of(tiling, choice.t_mm, choice.theta_rad, cells.hinge_mm, sheet.slit_mm, cut)
+    inside = cuts.inside(tiling, cut)
+    piece, closed = notched(piece_of(outline_loops(tiling), spec.border.margin_mm), inside.halves)
+    paths = inside.paths + closed
     mouths = np.array([path.points_mm[-1] for path in paths if path.opens]).reshape(-1, 2)
-    labels, labelled = label_paths(tiling, slits, cut, seam_pairs(tiling, flat))
-    piece = piece_of(outline_loops(tiling), spec.border.margin_mm)
+    labels, labelled = label_paths(tiling, cuts, cut, seam_pairs(tiling, flat))
     drawing, shift = framed(piece, mouths, paths + labels, spec.border, spec.cell_mm)
     parted = None
     if spec.bed_mm is not None and not fits(drawing.size_mm, spec.bed_mm):
-        parted = split(tiling, slits, cut, spec.border, spec.bed_mm, labels)
+        parted = split(tiling, cuts, cut, spec.border, spec.bed_mm, labels)
     return drawing, shift, labelled, parted

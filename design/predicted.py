@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from design.cells.bending_map import load_bending
+from design.cells.bending_map import bending_for
 from design.cells.library import CellLibrary
 from design.cells.select import Choice
 from design.deploy.indentation import Response, indentation_response
@@ -63,7 +63,7 @@ def predict(
 
 def _doubts(library: CellLibrary) -> list[Finding]:
     """Return what makes the prediction less sure."""
-    computed, sheet = load_bending().sheet, library.sheet
+    computed, sheet = bending_for(library).sheet, library.sheet
     asked, known = sheet.thickness_mm / sheet.edge_mm, computed.thickness_mm / computed.edge_mm
     if abs(asked / known - 1) < THICKNESS_RATIO:
         return []
@@ -86,7 +86,7 @@ def layout_of(tiling: Tiling, choice: Choice, cut: NDArray[np.bool_], library: C
     # At the very rim of the map Poisson's ratio cannot be interpolated: the nearest cell's is as good.
     nu = np.where(np.isfinite(at.nu_tangent_ratio), at.nu_tangent_ratio, _nearest_nu(choice, library))
     flat_mm2 = 6 * np.sqrt(3) / 4 * sheet.edge_mm**2
-    bending = load_bending().D_mJ(choice.expansion_ratio, choice.theta_rad, sheet)
+    bending = bending_for(library).D_mJ(choice.expansion_ratio, choice.theta_rad, sheet)
     expansion = np.where(cut, choice.expansion_ratio, 1.0)
     Y = np.where(cut, choice.stiffness_mJ / flat_mm2, sheet.E_MPa * sheet.thickness_mm)
     nu = np.where(cut, nu, sheet.nu_ratio)

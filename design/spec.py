@@ -13,6 +13,7 @@ from design.pattern.slits import HingeOptions
 from design.pattern.tiling import Placement
 from design.pattern.toolpath import ToolOptions
 
+Kind = Literal["expanding", "contracting"]
 Infeasible = Literal["report", "cones", "nearest", "both"]
 
 
@@ -40,6 +41,7 @@ class DesignSpec:
     """A design, asked for. Lengths in mm; `bed_mm` is the largest sheet the laser takes, None for no limit."""
 
     name: str
+    cells: Kind = "expanding"
     cell_mm: float = 10.0
     flatten: FlattenOptions = field(default_factory=FlattenOptions)
     infeasible: Infeasible = "report"

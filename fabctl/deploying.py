@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.bundle import open_bundle
-from design.cells.bending_map import load_bending
-from design.cells.library import load_library
+from design.cells.bending_map import bending_for
+from design.cells.hinges import with_hinge
 from design.cells.sheet import Sheet
 from design.deploy.designed import lift
 from design.deploy.levels import Layout, sheet_layout
@@ -21,10 +21,10 @@ from design.meshfiles import read_mesh
 from design.surface import TriMesh
 from fabctl.config.material import load_material
 from fabctl.config.spec import load_spec
-from fabctl.designing import sheet_of
+from fabctl.designing import library_of, sheet_of
 from fabctl.errors import RefusedError
 
-NUMBERS = ("cx_mm", "cy_mm", "inverted", "t_mm", "theta_deg", "expansion_ratio")
+NUMBERS = ("cx_mm", "cy_mm", "inverted", "t_mm", "theta_deg", "expansion_ratio", "hinge_mm")
 ROUNDING_MM = 1e-3  # cells.csv and the meshes are rounded to less than this
 
 
@@ -55,12 +55,14 @@ def read_laid(folder: Path, home: Path) -> Laid:
     flat = _flat_vertices(centre, inverted, edge_mm, shape)
     config, _ = load_spec(str(bundle.file("spec.yaml")), home)
     sheet = sheet_of(load_material(config.material, home), edge_mm)
-    library = load_library(Path(config.library) if config.library else None).scaled(sheet)
+    library = library_of(config).scaled(sheet)
+    if config.cells == "expanding":
+        library = with_hinge(library, float(np.median(table["hinge_mm"])))
     cells = library.at(t, theta)
     mean = float(np.nanmean(cells.nu_tangent_ratio))
     nu = np.where(np.isfinite(cells.nu_tangent_ratio), cells.nu_tangent_ratio, mean)
     Y = np.where(np.isfinite(cells.Y_N_mm), cells.Y_N_mm, np.nanmean(cells.Y_N_mm))
-    D = np.asarray(load_bending().D_mJ(expansion, theta, sheet))
+    D = np.asarray(bending_for(library).D_mJ(expansion, theta, sheet))
     # Cells that do not stay open are as the build's own prediction takes them: solid.
     stays_open = np.array([row["kind"] == "cut" for row in rows])
     expansion = np.where(stays_open, expansion, 1.0)

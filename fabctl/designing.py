@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from design.bundle import Bundle, write_bundle
+from design.cells.contracting import load_contracting
 from design.cells.library import CellLibrary, load_library
 from design.cells.select import select
 from design.cells.sheet import Sheet
@@ -23,7 +24,7 @@ from design.pattern.drawing import as_json
 from design.pattern.paths import Layer, LayerPreset
 from design.pattern.toolpath import ToolOptions
 from design.pipeline import Design, build
-from design.spec import DesignSpec
+from design.spec import DesignSpec, Kind
 from design.surface import TriMesh
 from design.targets import TARGETS
 from fabctl.config.material import LayerConfig, MaterialConfig, load_material
@@ -63,16 +64,26 @@ def _inputs_of(
     assert material.laser is not None  # presets_of has refused otherwise
     spec = config.to_design(edge_mm, sheet.hinge_mm, material.laser.kerf_mm)
     mesh, findings = read_target(config, beside, target)
-    library = load_library(Path(config.library) if config.library else None).scaled(sheet)
+    library = library_of(config).scaled(sheet)
     return Inputs(spec, text, mesh, library, presets, tuple(findings))
 
 
-def inputs_for(target: str, material: str, home: Path, cell_mm: float | None = None) -> Inputs:
+def library_of(config: SpecConfig) -> CellLibrary:
+    """Return the library of the cells that a specification takes."""
+    path = Path(config.library) if config.library else None
+    return load_library(path) if config.cells == "expanding" else load_contracting(path)
+
+
+def inputs_for(
+    target: str, material: str, home: Path, cell_mm: float | None = None, cells: Kind = "expanding"
+) -> Inputs:
     """Return the inputs for a target alone: a specification, a mesh file, or the name of one of our own surfaces."""
     if Path(target).suffix in (".yaml", ".yml"):
         return read_inputs(target, home, cell_mm=cell_mm)
     source: str | MadeTarget = MadeTarget(make=target) if target in TARGETS else target
-    config = SpecConfig(name=re.sub(r"\W", "-", Path(target).stem) or "target", target=source, material=material)
+    config = SpecConfig(
+        name=re.sub(r"\W", "-", Path(target).stem) or "target", target=source, material=material, cells=cells
+    )
     return _inputs_of(config, "", Path.cwd(), home, None, cell_mm)
 
 

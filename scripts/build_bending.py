@@ -1,4 +1,4 @@
-"""Compute the shipped map of bending stiffness anew: `python scripts/build_bending.py` (a few minutes)."""
+"""Compute the shipped maps of bending stiffness anew: `python scripts/build_bending.py [--open]` (a few minutes)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from design.cells.bending_map import SHIPPED, compute_map, save_map
+from design.cells.bending_map import SHIPPED, SHIPPED_OPEN, compute_map, save_map
+from design.cells.contracting import load_contracting
 from design.cells.library import load_library
 
 
 def main() -> None:
     """Compute and write."""
-    library = load_library()
+    is_open = "--open" in sys.argv[1:]
+    library = load_contracting() if is_open else load_library()
     table, failures = compute_map(library, watch=lambda done, name: print(f"{done:6.1%}  {name}", flush=True))
-    save_map(SHIPPED, library, table, failures)
+    save_map(SHIPPED_OPEN if is_open else SHIPPED, library, table, failures)
     print(f"{len(table['t_mm'])} cells, {len(failures)} without an answer")
     for line in failures:
         print(line)

@@ -18,9 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.cells.bending import PlaneCell, bend
-from design.cells.homogenise import Failure, solve_pair
+from design.cells.contracting import is_contracting
+from design.cells.homogenise import Failure, Pair, follow, solve_pair
 from design.cells.library import CellLibrary, LibraryError
 from design.cells.mesh import REFERENCE, Density
+from design.cells.open_cells import CLOSED_SHARE, open_model
+from design.cells.sector import Model
 from design.cells.select import SelectionOptions, on_curve, selection_curve
 from design.cells.sheet import Sheet
 from design.cells.tiling import tiling
@@ -29,6 +32,7 @@ from design.errors import NotConverged
 Array = NDArray[np.float64]
 FORMAT = 1
 SHIPPED = Path(__file__).parent / "data" / "bending.npz"
+SHIPPED_OPEN = SHIPPED.with_name("bending-open.npz")
 EXPANSION_STEP_RATIO = 0.06  # between the computed cells of one angle
 CURVE_STEP_RATIO = 0.025  # between those along the curve of selected cells
 COLUMN_STEP = 2  # of the library's angles
@@ -95,10 +99,23 @@ def _interpolators(found: BendingMap) -> tuple[Callable[[Array], Array], Callabl
 def plane_cell(t_mm: float, theta_rad: float, sheet: Sheet, density: Density = REFERENCE) -> PlaneCell | Failure:
     """Return the two-unit cell (t, θ) at rest and at its second stable state, or why there is none."""
     found = solve_pair(t_mm, theta_rad, sheet, density)
-    if isinstance(found, Failure):
-        return found
-    model, pair = found
-    tile, edge, s = tiling(density, 2), sheet.edge_mm, pair.stable.s_ratio
+    return found if isinstance(found, Failure) else laid_out(*found)
+
+
+def contracting_plane_cell(t_mm: float, theta_rad: float, sheet: Sheet) -> tuple[PlaneCell, float] | Failure:
+    """Return the two units of an open cell, and its edge over the sheet's; the slit cell has the sheet's own edge."""
+    slit = solve_pair(t_mm, theta_rad, sheet, REFERENCE)
+    if isinstance(slit, Failure):
+        return slit
+    model, pair = slit
+    opened = open_model(model, pair, sheet)
+    found = follow(opened, CLOSED_SHARE / pair.stable.s_ratio)
+    return found if isinstance(found, Failure) else (laid_out(opened, found), pair.stable.s_ratio)
+
+
+def laid_out(model: Model, pair: Pair) -> PlaneCell:
+    """Return the two-unit cell of a solved sector."""
+    tile, edge, s = tiling(model.density, 2), model.edge_mm, pair.stable.s_ratio
     local = model.nodes(pair.stable.y, s)
     copies = len(tile.turns)
 
@@ -112,6 +129,19 @@ def plane_cell(t_mm: float, theta_rad: float, sheet: Sheet, density: Density = R
         laid(model.rest_mm, 1.0), laid(local, s), triangles.reshape(-1, 6), tile.owner.ravel(),
         edge * tile.jump.reshape(-1, 2), float(np.sqrt(0.75)) * edge**2, s,
     )  # fmt: skip
+
+
+def plane_cell_of(library: CellLibrary, t_mm: float, theta_rad: float) -> tuple[PlaneCell, float] | Failure:
+    """Return a cell of the library in the plane and the thickness that belongs to its size, or why there is none.
+
+    D over E·h³/12 has no unit: a contracting cell is solved larger than it is cut, and as much thicker.
+    """
+    sheet = library.sheet
+    if not is_contracting(library):
+        found = plane_cell(t_mm, theta_rad, sheet)
+        return found if isinstance(found, Failure) else (found, sheet.thickness_mm)
+    opened = contracting_plane_cell(t_mm, theta_rad, sheet)
+    return opened if isinstance(opened, Failure) else (opened[0], opened[1] * sheet.thickness_mm)
 
 
 def chosen_cells(library: CellLibrary) -> Array:
@@ -137,17 +167,18 @@ def compute_map(
     cells = chosen_cells(library)
     for k, (t, theta) in enumerate(cells):
         name = f"t {t:.3f} mm, θ {np.degrees(theta):.2f}°"
-        cell = plane_cell(float(t), float(theta), sheet)
-        if isinstance(cell, Failure):
-            failures.append(f"{name}: {cell.reason}")
+        solved = plane_cell_of(library, float(t), float(theta))
+        if isinstance(solved, Failure):
+            failures.append(f"{name}: {solved.reason}")
             continue
+        cell, thickness_mm = solved
         try:
-            found = bend(cell, sheet.thickness_mm, sheet.nu_ratio, layers)
+            found = bend(cell, thickness_mm, sheet.nu_ratio, layers)
         except NotConverged as fault:
             failures.append(f"{name}, expansion {cell.expansion_ratio:.4f}: {fault}")
             continue
         rows.append(
-            (t, theta, cell.expansion_ratio, found.relative_ratio(sheet.thickness_mm), found.nu_ratio,
+            (t, theta, cell.expansion_ratio, found.relative_ratio(thickness_mm), found.nu_ratio,
              found.anisotropy_ratio, found.expansion_ratio)
         )  # fmt: skip
         if watch is not None:
@@ -163,6 +194,11 @@ def save_map(path: Path, library: CellLibrary, table: dict[str, Array], failures
     text = np.frombuffer(json.dumps(meta, sort_keys=True).encode(), dtype=np.uint8)
     np.savez_compressed(buffer, meta=text, **table)  # type: ignore[arg-type]
     path.write_bytes(buffer.getvalue())
+
+
+def bending_for(library: CellLibrary) -> BendingMap:
+    """Return the shipped map for a library's kind of cells."""
+    return load_bending(SHIPPED_OPEN if is_contracting(library) else SHIPPED)
 
 
 @functools.lru_cache(maxsize=4)

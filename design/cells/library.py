@@ -156,6 +156,11 @@ class CellLibrary:
         grid = grid_of(self.table["t_mm"], self.table["theta_rad"], self.table[name][None], self.sheet)
         return float(grid(np.array([t_mm]), np.array([theta_rad]))[0, 0])
 
+    @classmethod
+    def of_table(cls, table: dict[str, Array], meta: dict[str, Any], key: str, sheet: Sheet) -> CellLibrary:
+        """Return the library of a table of candidates, whose `meta` says for which sheet it stands."""
+        return _with_sheet(table, meta, key, sheet)
+
     def scaled(self, sheet: Sheet) -> CellLibrary:
         """Return the library for a sheet of the same slit/edge, hinge/edge and ν: lengths and energies only scale."""
         mine, asked = shape_of(self.sheet), shape_of(sheet)

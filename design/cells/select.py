@@ -111,9 +111,14 @@ class SelectionCurve:
         return float(self.expansion_ratio[0]), float(self.expansion_ratio[-1])
 
 
-def table_of(library: CellMap, barrier_floor_mJ: float = 0.0) -> Table:
-    """Return the library resampled to rows of equal expansion; cells under the barrier floor are left out."""
-    columns = _columns(library, barrier_floor_mJ)
+def table_of(
+    library: CellMap, barrier_floor_mJ: float = 0.0, rows: Array | None = None, angles_rad: Array | None = None
+) -> Table:
+    """Return the library resampled to rows of equal expansion; cells under the barrier floor are left out.
+
+    `rows` and `angles_rad` take the place of the library's own expansions and angles.
+    """
+    columns = _columns(library, barrier_floor_mJ, angles_rad)
     if not columns:
         raise DesignError(
             f"no cell of the library has a barrier of {barrier_floor_mJ:g} mJ; the highest is "
@@ -121,7 +126,8 @@ def table_of(library: CellMap, barrier_floor_mJ: float = 0.0) -> Table:
         )
     low = min(column.expansion_ratio[-1] for column in columns)
     high = max(column.expansion_ratio[0] for column in columns)
-    rows = np.linspace(low, high, max(2, round((high - low) / STEP_RATIO) + 1))
+    if rows is None:
+        rows = np.linspace(low, high, max(2, round((high - low) / STEP_RATIO) + 1))
     shape = (len(rows), len(columns))
     t, stiffness, barrier = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
     for k, column in enumerate(columns):
@@ -153,21 +159,26 @@ class _Samples:
     stiffness_mJ: Array
 
 
-def _densely(library: CellMap) -> CellMap:
+def angles_of(library: CellMap) -> Array:
+    """Return the dense angles on which a library is read that can interpolate itself."""
+    return np.linspace(library.theta_rad.min(), library.theta_rad.max(), DENSE_COLUMNS_COUNT)
+
+
+def _densely(library: CellMap, angles_rad: Array | None) -> CellMap:
     """Return the library on dense columns where it can interpolate itself, else as it is."""
     at = getattr(library, "at", None)
     if at is None:
         return library
-    theta_rad = np.linspace(library.theta_rad.min(), library.theta_rad.max(), DENSE_COLUMNS_COUNT)
+    theta_rad = angles_of(library) if angles_rad is None else angles_rad
     t_mm = np.linspace(library.t_mm.min(), library.t_mm.max(), DENSE_ROWS_COUNT)
     cells = at(*(grid.ravel() for grid in np.meshgrid(t_mm, theta_rad)))
     fields = (cells.t_mm, cells.theta_rad, cells.expansion_ratio, cells.barrier_mJ, cells.stiffness_mJ)
     return _Samples(*(field[cells.inside] for field in fields))
 
 
-def _columns(library: CellMap, floor_mJ: float) -> list[_Column]:
+def _columns(library: CellMap, floor_mJ: float, angles_rad: Array | None) -> list[_Column]:
     found = []
-    library = _densely(library)
+    library = _densely(library, angles_rad)
     angles, which = np.unique(np.round(library.theta_rad, 7), return_inverse=True)
     if len(angles) > COLUMNS_LIMIT_COUNT:
         raise DesignError(
@@ -176,7 +187,11 @@ def _columns(library: CellMap, floor_mJ: float) -> list[_Column]:
     for k, theta in enumerate(angles):
         rows = np.flatnonzero((which == k) & (library.barrier_mJ >= floor_mJ))
         rows = rows[np.argsort(library.t_mm[rows], kind="stable")]
-        rows = rows[: _falling_count(library.expansion_ratio[rows])]
+        ratio = library.expansion_ratio[rows]
+        if len(rows) > 1 and ratio[0] < ratio[-1]:  # contracting cells close less and less as t grows
+            rows = rows[: _falling_count(-ratio)][::-1]
+        else:
+            rows = rows[: _falling_count(ratio)]
         if len(rows) < 2:
             continue
         values = (library.expansion_ratio, library.t_mm, library.stiffness_mJ, library.barrier_mJ)
@@ -192,7 +207,11 @@ def _falling_count(expansion_ratio: Array) -> int:
 
 def selection_curve(library: CellMap, options: SelectionOptions = SelectionOptions()) -> SelectionCurve:
     """Return the rule's choice over the whole range; not for the published rule, which has no curve."""
-    table = table_of(library, options.barrier_floor_mJ)
+    return curve_of(table_of(library, options.barrier_floor_mJ), options)
+
+
+def curve_of(table: Table, options: SelectionOptions) -> SelectionCurve:
+    """Return the rule's choice over all rows of a table."""
     stiffness = np.where(np.isnan(table.stiffness_mJ), -np.inf, table.stiffness_mJ)
     best = stiffness.max(axis=1)
     if options.rule == "smooth":
@@ -200,7 +219,7 @@ def selection_curve(library: CellMap, options: SelectionOptions = SelectionOptio
     else:
         theta_rad = table.theta_rad[_best_column(table.barrier_mJ if options.rule == "barrier" else table.stiffness_mJ)]
     values = [_along(table, value, theta_rad) for value in (table.t_mm, table.stiffness_mJ, table.barrier_mJ)]
-    rows = slice(_smooth_from(values[0]) if options.rule == "smooth" else 0, None)
+    rows = _smooth_rows(values[0]) if options.rule == "smooth" else slice(0, None)
     t, chosen, barrier = (value[rows] for value in values)
     return SelectionCurve(options, table.expansion_ratio[rows], t, theta_rad[rows], chosen, barrier, best[rows], table)
 
@@ -209,16 +228,17 @@ def _best_column(value: Array) -> NDArray[np.int64]:
     return np.asarray(np.argmax(np.where(np.isnan(value), -np.inf, value), axis=1))
 
 
-def _smooth_from(t_mm: Array) -> int:
-    """Return the first row above the highest jump: near the bistable limit the library is ragged, and no cap helps."""
-    jumps = np.flatnonzero(~(np.abs(np.diff(t_mm)) <= JUMP_MM))
-    start = int(jumps[-1]) + 1 if len(jumps) else 0
-    if start > len(t_mm) - 2:
+def _smooth_rows(t_mm: Array) -> slice:
+    """Return the longest run of rows without a jump: near the bistable limit a library is ragged, whatever the cap."""
+    ends = np.r_[-1, np.flatnonzero(~(np.abs(np.diff(t_mm)) <= JUMP_MM)), len(t_mm) - 1]
+    longest = int(np.argmax(np.diff(ends)))
+    start, stop = int(ends[longest]) + 1, int(ends[longest + 1]) + 1
+    if stop - start < 2:
         raise DesignError(
             "no smooth curve of cells runs through this library within the allowed loss of stiffness; "
             "raise max_stiffness_loss_frac, take the rule `stiffest`, or a finer library"
         )
-    return start
+    return slice(start, stop)
 
 
 def select(library: CellMap, expansion_ratio: Array, options: SelectionOptions = SelectionOptions()) -> Choice:

@@ -12,15 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from design.flatten import Flattening
 from design.flatten.result import Seam
+from design.pattern.cuts import Cuts
 from design.pattern.font import Anchor, text_strokes, text_width_mm
 from design.pattern.paths import CutPath
-from design.pattern.slits import Slits
 from design.pattern.tiling import Array, Index, Tiling
 
 PITCH_EDGES_COUNT = 2.0  # cell edges along a seam from one pair to the next
@@ -118,17 +117,15 @@ def _stations_mm(flat: Flattening, side: Index, edge_mm: float) -> Array:
 
 
 def label_paths(
-    tiling: Tiling, slits: Slits, cut: NDArray[np.bool_], pairs: Sequence[Pair]
+    tiling: Tiling, cuts: Cuts, cut: NDArray[np.bool_], pairs: Sequence[Pair]
 ) -> tuple[list[CutPath], list[Pair]]:
     """Return the strokes of all labels that can be read, and the pairs which they name.
 
-    Letters keep clear of the cell's slits; where that leaves less than `LEAST_HEIGHT_MM`, the pair has no label.
+    Letters keep clear of the cell's cuts; where that leaves less than `LEAST_HEIGHT_MM`, the pair has no label.
     """
     centres = tiling.centres_mm()
-    lines = shapely.linestrings(np.stack([slits.edge_mm, slits.kink_mm, slits.inner_mm], axis=2).reshape(-1, 3, 2))
-    away = shapely.distance(lines, shapely.points(np.repeat(centres, 3, axis=0))).reshape(-1, 3).min(axis=1)
     border = tiling.edge_mm / math.sqrt(12)  # from a cell's middle to its edges
-    free_mm = CLEAR_RATIO * np.where(cut, np.minimum(away, border), border)
+    free_mm = CLEAR_RATIO * np.where(cut, np.minimum(cuts.free_mm(tiling), border), border)
     strokes: list[CutPath] = []
     named = []
     for pair in pairs:

@@ -61,9 +61,8 @@ def _inner_first(strokes: Sequence[CutPath]) -> list[list[CutPath]]:
         return []
     areas = [shapely.Polygon(s.points_mm) if len(s.points_mm) > 3 else shapely.Polygon() for s in strokes]
     starts = [shapely.Point(s.points_mm[0]) for s in strokes]
-    depth = [
-        sum(area.contains(start) for other, area in enumerate(areas) if other != k) for k, start in enumerate(starts)
-    ]
+    held, holder = shapely.STRtree(areas).query(starts, predicate="within")
+    depth = np.bincount(held[held != holder], minlength=len(strokes)).tolist()
     return [
         [s for s, d in zip(strokes, depth, strict=True) if d == level] for level in sorted(set(depth), reverse=True)
     ]

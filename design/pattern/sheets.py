@@ -16,10 +16,11 @@ from scipy.sparse.csgraph import connected_components
 from shapely.geometry.base import BaseGeometry
 
 from design.pattern.border import BorderOptions, framed, piece_of, rimmed_by
+from design.pattern.cuts import Cuts, notched
 from design.pattern.drawing import Drawing
 from design.pattern.paths import CutPath
 from design.pattern.seams import PITCH_EDGES_COUNT, Pair, label_paths
-from design.pattern.slits import Slits, outline_loops, slit_paths
+from design.pattern.slits import outline_loops
 from design.pattern.tiling import ROW_RATIO, Index, Tiling
 
 MORE_COUNT = 5  # columns and rows tried beyond what the cells alone would need, for teeth, tags and rims
@@ -41,7 +42,7 @@ def fits(size_mm: tuple[float, float], bed_mm: tuple[float, float]) -> bool:
 
 def split(
     tiling: Tiling,
-    slits: Slits,
+    cuts: Cuts,
     cut: NDArray[np.bool_],
     border: BorderOptions,
     bed_mm: tuple[float, float],
@@ -64,11 +65,13 @@ def split(
         if not all(fits((box[0] + room, box[1] + room), bed_mm) for box in boxes):
             continue
         pairs = join_pairs(tiling, part, labelled)
-        labels, named = label_paths(tiling, slits, cut, pairs)
+        labels, named = label_paths(tiling, cuts, cut, pairs)
         drawings = []
         for k, piece in enumerate(pieces_of(tiling, part, border.margin_mm)):
             mine = part == k
-            paths = slit_paths(tiling, slits, cut & mine)
+            inside = cuts.inside(tiling, cut & mine)
+            piece, closed = notched(piece, inside.halves)
+            paths = inside.paths + closed
             mouths = np.array([path.points_mm[-1] for path in paths if path.opens]).reshape(-1, 2)
             paths += [label for label in [*seam_labels, *labels] if label.cell is not None and mine[label.cell]]
             joins = shapely.union_all(shapely.polygons(tiling.vertices_mm[tiling.cells[~mine]]))

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
+from design.pattern.cuts import Inside
 from design.pattern.paths import CutPath
 from design.pattern.tiling import Array, Tiling
 
@@ -49,6 +51,16 @@ class Slits:
     edge_mm: Array
     kink_mm: Array
     inner_mm: Array
+
+    def inside(self, tiling: Tiling, cut: NDArray[np.bool_]) -> Inside:
+        """Return the slits of the cells in `cut`; a half slit needs nothing of the border."""
+        return Inside(slit_paths(tiling, self, cut), [])
+
+    def free_mm(self, tiling: Tiling) -> Array:
+        """Return how far around its centroid each cell is uncut, `(k,)`."""
+        lines = shapely.linestrings(np.stack([self.edge_mm, self.kink_mm, self.inner_mm], axis=2).reshape(-1, 3, 2))
+        at = shapely.points(np.repeat(tiling.centres_mm(), 3, axis=0))
+        return np.asarray(shapely.distance(lines, at).reshape(-1, 3).min(axis=1))
 
 
 def slits_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, cast
 
 import click
 
@@ -56,11 +57,15 @@ def build(
 @click.argument("target")
 @click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell [the material's].")
+@click.option("--cells", type=click.Choice(["expanding", "contracting"]), default="expanding", show_default=True,
+              help="Kind of cells, where TARGET is no specification.")  # fmt: skip
 @click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]), default="none", show_default=True,
               help="What to try where no single sheet fits.")  # fmt: skip
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG of where the surface does not fit.")
 @json_option
-def check(target: str, material: str, cell_mm: float | None, remedy: str, picture: Path | None, as_json: bool) -> None:
+def check(
+    target: str, material: str, cell_mm: float | None, cells: str, remedy: str, picture: Path | None, as_json: bool
+) -> None:
     """Say whether a sheet can become TARGET: a mesh file, a specification, or one of the project's own surfaces."""
     from design.checking import check as checked
     from design.checking import misfit_png
@@ -68,7 +73,7 @@ def check(target: str, material: str, cell_mm: float | None, remedy: str, pictur
     from fabctl.errors import DONE, REFUSED
 
     listen = progress()
-    inputs = inputs_for(target, material, lab().root, cell_mm)
+    inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells))
 
     def watch(message: str, done_frac: float) -> None:
         listen(Event("progress", message, done_frac))
@@ -90,8 +95,8 @@ def check(target: str, material: str, cell_mm: float | None, remedy: str, pictur
     if found.design is not None:
         width, height = found.design.drawing.size_mm
         minutes = found.design.job.time_s / 60
-        cells = len(found.design.cells.wanted_ratio)
-        lines.append(f"the sheet: {cells} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
+        count = len(found.design.cells.wanted_ratio)
+        lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
     show({"target": target, "fits": fits, **found.as_dict()}, as_json, lines)
@@ -137,3 +142,36 @@ def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, 
         lines.append(f"{patch.label.split()[0]}  hinge {patch.hinge_mm:.3f} mm  {expected}")
     rows = [{"patch": p.label, "hinge_mm": p.hinge_mm, "expansion_ratio": p.expansion_ratio} for p in patches]
     show({"folder": str(output), "patches": rows}, as_json, lines)
+
+
+@command.command("coupon-read")
+@click.argument("form", type=click.Path(path_type=Path))
+@click.option("--length-error-mm", type=click.FloatRange(min=0), default=0.2, show_default=True,
+              help="Standard error of one reading of a length.")  # fmt: skip
+@click.option("--specimen", help="Specimen whose record is told where this coupon's result lies.")
+@json_option
+def coupon_read(form: Path, length_error_mm: float, specimen: str | None, as_json: bool) -> None:
+    """Read a coupon's filled FORM (coupon.csv, or its folder): measured expansions against the map."""
+    from dataclasses import asdict
+
+    from fabctl.coupon import read_form, write_measured
+
+    form = form / "coupon.csv" if form.is_dir() else form
+    patches = read_form(form, length_error_mm)
+    written = write_measured(form, patches, length_error_mm)
+    if specimen is not None:
+        lab().specimen(specimen).note(coupon=str(written.resolve()))
+    lines = [f"{'patch':6}{'hinge, mm':>10}{'expected':>10}{'measured':>10}{'± 95 %':>9}{'off':>9}  cycles"]
+    for patch in patches:
+        expected, off = patch.expected_ratio, patch.off_ratio()
+        told = f"{expected:10.4f}" if expected is not None else f"{'none':>10}"
+        away = f"{off:+9.4f}" if off is not None else f"{'':>9}"
+        ended = f", torn at {patch.failed_at_count}" if patch.failed_at_count is not None else ""
+        lines.append(
+            f"{patch.patch:6}{patch.hinge_mm:10.3f}{told}{patch.expansion_ratio:10.4f}{patch.uncertainty_ratio:9.4f}"
+            f"{away}  {patch.cycles_count}{ended}"
+        )
+    outside = [patch.patch for patch in patches if patch.agrees() is False]
+    lines.append(f"outside their uncertainty: {', '.join(outside)}" if outside else "all agree with the map")
+    rows = [asdict(patch) | {"off_ratio": patch.off_ratio(), "agrees": patch.agrees()} for patch in patches]
+    show({"file": str(written), "patches": rows}, as_json, lines)

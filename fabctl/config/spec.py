@@ -16,7 +16,7 @@ from design.pattern.border import BorderOptions
 from design.pattern.slits import HingeOptions, HingeRule
 from design.pattern.tiling import Placement
 from design.pattern.toolpath import Sides, ToolOptions
-from design.spec import DesignSpec, Infeasible, Region, ResponseOptions
+from design.spec import DesignSpec, Infeasible, Kind, Region, ResponseOptions
 from fabctl.config.bench import Positive, find
 from fabctl.config.loader import Model, load
 
@@ -134,6 +134,7 @@ class SpecConfig(Model):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     target: str | MadeTarget
     material: str = "natural-rubber-2.3"
+    cells: Kind = "expanding"
     cell_mm: Positive | None = None
     library: str | None = None
     flatten: FlattenConfig = FlattenConfig()
@@ -150,6 +151,20 @@ class SpecConfig(Model):
     bed_mm: tuple[Positive, Positive] | None = None
     response: ResponseConfig | None = ResponseConfig()
 
+    @model_validator(mode="after")
+    def _contracting_cells_as_simulated(self) -> SpecConfig:
+        if self.cells == "expanding":
+            return self
+        wrong = {
+            "`hinge`: theirs follow from `cell_mm`": self.hinge != HingeConfig(),
+            "`monostable` regions: none of them is known to spring open": bool(self.monostable),
+            "`selection.rule: published`: it is for expanding cells": self.selection.rule == "published",
+        }
+        faults = [text for text, is_so in wrong.items() if is_so]
+        if faults:
+            raise ValueError("`cells: contracting` takes no " + "; no ".join(faults))
+        return self
+
     def to_design(self, cell_mm: float, hinge_mm: float, kerf_mm: float) -> DesignSpec:
         """Return the specification as the design package knows it; what the file leaves open comes from the material.
 
@@ -159,6 +174,7 @@ class SpecConfig(Model):
         hinge = self.hinge.width_mm if self.hinge.width_mm is not None else hinge_mm
         return DesignSpec(
             name=self.name,
+            cells=self.cells,
             cell_mm=cell_mm,
             flatten=FlattenOptions(**self.flatten.model_dump()),
             infeasible=self.infeasible,

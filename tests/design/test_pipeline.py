@@ -11,12 +11,13 @@ import pytest
 
 from design.bundle import open_bundle, write_bundle
 from design.cells.library import load_library
-from design.errors import BundleError, OutOfLibrary
+from design.errors import BundleError, DesignError, OutOfLibrary
 from design.pattern.assign import ScaleOptions
 from design.pattern.border import BorderOptions
 from design.pattern.paths import LAYERS, LayerPreset
 from design.pipeline import Design, build
 from design.spec import DesignSpec, ResponseOptions
+from design.surface import TriMesh
 from design.targets import cap, spike
 
 PRESETS = {layer: LayerPreset(0.5, 20.0) for layer in LAYERS}
@@ -128,3 +129,10 @@ def test_without_a_tag_there_is_no_place_for_an_id() -> None:
         replace(SPEC, border=BorderOptions(id_height_mm=0)), cap(radius_mm=40, edge_mm=5), load_library(), PRESETS
     )
     assert made.drawing.id_anchor is None
+
+
+def test_a_target_in_wrong_units_is_refused_before_millions_of_cells_are_laid() -> None:
+    mesh = cap(edge_mm=12)
+    huge = TriMesh(mesh.vertices_mm * 1000, mesh.faces)
+    with pytest.raises(DesignError, match="units"):
+        build(DesignSpec("huge", response=None), huge, load_library(), PRESETS)
