@@ -42,11 +42,7 @@ def predict(
     watch: Callable[[str, float], None],
 ) -> Predicted:
     """Return what the shell model says of the cells on their sheet. Raises `NotConverged` where it finds no shape."""
-    layout, design_mm = layout_of(tiling, choice, cut, library), lifted(flat, tiling.vertices_mm)
-    if tiling.twins is not None:
-        right = np.flatnonzero(tiling.twins != np.arange(len(tiling.twins)))
-        layout = weld(layout, np.column_stack([tiling.twins[right], right]))
-        design_mm = np.delete(design_mm, right, axis=0)
+    layout, design_mm = welded(layout_of(tiling, choice, cut, library), tiling, lifted(flat, tiling.vertices_mm))
     deployed = deploy(layout, flat.mesh, design_mm)
     watch("pressing the indenter", 0.8)
     response = indentation_response(
@@ -59,6 +55,14 @@ def predict(
         watch=lambda share: watch("pressing the indenter", 0.8 + 0.2 * share),
     )
     return Predicted(deployed, response, tuple(_doubts(library)))
+
+
+def welded(layout: Layout, tiling: Tiling, design_mm: Array) -> tuple[Layout, Array]:
+    """Return the layout with the tiling's seam joined, and the places of the vertices that are left, `(n, 3)`."""
+    if tiling.twins is None:
+        return layout, design_mm
+    right = np.flatnonzero(tiling.twins != np.arange(len(tiling.twins)))
+    return weld(layout, np.column_stack([tiling.twins[right], right])), np.delete(design_mm, right, axis=0)
 
 
 def _doubts(library: CellLibrary) -> list[Finding]:
