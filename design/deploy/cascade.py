@@ -16,12 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from design.deploy.compare import kabsch
 from design.deploy.levels import Layout
 from design.deploy.newton import System, solve
 from design.deploy.shell import Ints, Reals, Shell, neighbours
 from design.errors import NotConverged
 
 TOLERANCE_RATIO = 1e-7  # of a step on the way; the last shape is solved to the usual one
+HINT_RATIO = 0.01  # of the intended height
 NUDGE_RATIO = 1e-3  # of an edge: an exactly flat sheet would not know to which side to buckle
 
 
@@ -88,18 +90,19 @@ def cascade(
     wells: Wells,
     order: Sequence[int] | Ints | None = None,
     hold: bool = True,
+    intended_mm: Reals | None = None,
     frames_count: int = 24,
     watch: Callable[[float], None] | None = None,
 ) -> Cascade:
     """Return what happens when the units are pulled open one after the other, from flat; `order` names them.
 
     A unit that another one took along is not pulled again. With `hold` a unit is let go once all its neighbours have
-    been pulled, without it at once; at the end every one is. A pull that finds no rest is named in `failed` and undone.
+    been pulled, without it at once; at the end every one is. `intended_mm` `(n, 3)` hints to which side the sheet is to
+    bulge, by a hundredth of its height. A pull that finds no rest is named in `failed` and undone.
     """
     shell = with_wells(layout.shell(), wells)
     order = from_the_middle(layout) if order is None else np.asarray(order)
-    flat, rng = layout.flat_mm(), np.random.default_rng(5)
-    x = np.column_stack([flat, NUDGE_RATIO * layout.edge_mm * rng.normal(size=len(flat))])
+    x = _nearly_flat(layout, intended_mm)
     free, hand = System(shell), _Hand(neighbours(layout.cells), hold)
     is_open = np.zeros(len(layout.cells), dtype=bool)
     steps: list[Step] = []
@@ -121,6 +124,17 @@ def cascade(
         tuple(steps), (*frames, last.x_mm), last.x_mm, share_of(shell, last.x_mm) > wells.saddle_ratio,
         last.energy_mJ, last.residual_ratio, last.stable, tuple(failed),
     )  # fmt: skip
+
+
+def _nearly_flat(layout: Layout, intended_mm: Reals | None) -> Reals:
+    """Return the flat sheet with heights too small to matter: a hundredth of those intended, or none in particular."""
+    flat = np.column_stack([layout.flat_mm(), np.zeros(layout.vertex_count)])
+    if intended_mm is None:
+        flat[:, 2] = NUDGE_RATIO * layout.edge_mm * np.random.default_rng(5).normal(size=len(flat))
+        return flat
+    rotation, _ = kabsch(intended_mm, flat)
+    flat[:, 2] = HINT_RATIO * (intended_mm @ rotation.T)[:, 2]
+    return flat
 
 
 class _Hand:

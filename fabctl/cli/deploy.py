@@ -131,17 +131,21 @@ def _shapes(laid: Laid, count: int, emit: Emit) -> list[dict[str, Any]]:
 def _cascade(laid: Laid, folder: Path, popped: Deployed, animation: bool, emit: Emit) -> dict[str, Any]:
     """Open the sheet unit by unit; write every step into `cascade.csv` and the way as an animation."""
     from design.deploy.cascade import cascade, cascade_csv
+    from design.deploy.path import followed
     from design.deploy.predict import compared
     from fabctl.deploying import animation_gif, wells_of
     from fabctl.events import Event
     from fabctl.records.folder import write_atomically
 
     found = cascade(
-        laid.layout, wells_of(laid), watch=lambda done: emit(Event("progress", "opening unit after unit", done))
+        laid.layout,
+        wells_of(laid),
+        intended_mm=popped.mesh.vertices_mm,
+        watch=lambda done: emit(Event("progress", "opening unit after unit", done)),
     )
     write_atomically(folder / "cascade.csv", cascade_csv(found))
     if animation:
-        gif = animation_gif(list(found.frames_mm), popped.mesh, "opened unit by unit")
+        gif = animation_gif(followed(found.frames_mm, popped.mesh.vertices_mm), popped.mesh, "opened unit by unit")
         (folder / "cascade.gif").write_bytes(gif)
     end = replace(popped.equilibrium, x_mm=found.x_mm)
     off = compared(laid.layout, end, laid.target, laid.design_mm).deviation

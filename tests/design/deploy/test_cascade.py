@@ -8,6 +8,7 @@ import pytest
 from design.cells.homogenise import CURVE_SHARES
 from design.cells.library import hexagon_mm2, load_library
 from design.deploy.cascade import Wells, cascade, cascade_csv, share_of, with_wells
+from design.deploy.compare import kabsch
 from design.deploy.levels import sheet_layout
 from design.deploy.newton import System, solve
 
@@ -75,6 +76,19 @@ def test_an_even_sheet_ends_flat_and_expanded(lattice, cell) -> None:
     end_mJ = wells.energy_mJ_mm2[0][np.argmin(np.abs(CURVE_SHARES - 1))] * len(layout.cells) * np.sqrt(0.1875) * 100
     assert found.energy_mJ == pytest.approx(end_mJ, rel=1e-3)
     assert len(cascade_csv(found).splitlines()) == len(found.steps) + 1
+
+
+def test_the_sheet_bulges_to_the_side_it_is_meant_to(cap_of, cell) -> None:
+    _, _, energy = cell
+    cap = cap_of(edge_mm=20.0)
+    many = np.tile(energy, (len(cap.layout.cells), 1))
+    wells = Wells(CURVE_SHARES, many, np.full(len(many), CURVE_SHARES[int(np.argmax(energy[CURVE_SHARES < 1]))]))
+    for sign in (1.0, -1.0):
+        found = cascade(cap.layout, wells, intended_mm=cap.design_mm * [1, 1, sign])
+        assert found.is_open.mean() > 0.5
+        rotation, shift = kabsch(found.x_mm, cap.design_mm * [1, 1, sign])
+        same = np.sqrt(np.mean(np.sum((found.x_mm @ rotation.T + shift - cap.design_mm * [1, 1, sign]) ** 2, axis=1)))
+        assert same < 5.0
 
 
 def test_a_unit_pulled_alone_is_closed_again_by_its_neighbours(lattice, cell) -> None:
