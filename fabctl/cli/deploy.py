@@ -63,7 +63,7 @@ def command(
         emit(Event("stage", f"its weight acts; rim: {support}"))
         settled = settle(laid.layout, popped.mesh.vertices_mm, laid.sheet, support, friction, not level_floor)
     folder = output or design.with_name(design.name + "-deployed")
-    facts = {**_facts(popped), **_sag(settled, support)}
+    facts = {**_facts(popped), **_softest(laid, popped), **_sag(settled, support)}
     if shapes:
         facts["shapes"] = _shapes(laid, shapes, emit)
     if compensate:
@@ -90,6 +90,14 @@ def _facts(popped: Deployed) -> dict[str, Any]:
         "residual_ratio": rest.residual_ratio,
         "iterations_count": rest.iterations_count,
     }
+
+
+def _softest(laid: Laid, popped: Deployed) -> dict[str, Any]:
+    """Return how far the shape is from giving way: the smallest stiffness of any small motion, rigid ones held."""
+    from design.deploy.newton import System, smallest_eigenvalue_N_mm
+
+    system = System(laid.layout.shell())
+    return {"smallest_eigenvalue_N_mm": smallest_eigenvalue_N_mm(system, popped.equilibrium.x_mm, (), None)}
 
 
 def _sag(settled: Settled | None, support: str) -> dict[str, Any]:
@@ -204,7 +212,8 @@ def _lines(facts: dict[str, Any]) -> list[str]:
     lines = [
         f"{facts['units_count']} units: {facts['deviation_mean_mm']:.2f} mm from the target on average "
         f"({facts['deviation_mean_frac']:.2%} of its diagonal), {facts['deviation_max_mm']:.2f} mm at most",
-        f"{'stable' if facts['stable'] else 'not stable'}; residual {facts['residual_ratio']:.1e} "
+        f"{'stable' if facts['stable'] else 'not stable'} "
+        f"(smallest eigenvalue {facts['smallest_eigenvalue_N_mm']:.1e} N/mm); residual {facts['residual_ratio']:.1e} "
         f"after {facts['iterations_count']} iterations",
     ]
     if "sag_mm" in facts:

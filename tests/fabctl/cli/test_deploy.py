@@ -40,6 +40,7 @@ def test_deploying_a_design_writes_shape_pictures_and_numbers(folder: Path, tmp_
     assert ran.exit_code == 0
     told = json.loads(ran.stdout)
     assert told["stable"] is True
+    assert told["smallest_eigenvalue_N_mm"] > 0
     assert told["residual_ratio"] < 1e-8
     assert told["loaded_residual_ratio"] < 1e-8
     assert 0 < told["sag_mm"] < 5
