@@ -195,6 +195,7 @@ def facts(design: Design) -> dict[str, Any]:
     expansion = design.cells.choice.expansion_ratio
     found: dict[str, Any] = {
         "cells_count": len(expansion),
+        "cell_mm": design.spec.cell_mm,
         "expansion_low_ratio": float(expansion.min()),
         "expansion_high_ratio": float(expansion.max()),
         "sheet_mm": list(design.drawing.size_mm),

@@ -14,6 +14,7 @@ from design.cells.library import CellLibrary
 from design.cells.monostable import monostable_cells
 from design.cells.select import Choice, SelectionCurve, on_curve, select, selection_curve
 from design.cells.sheet import Sheet
+from design.compensated import compensated
 from design.errors import OutOfLibrary
 from design.findings import Finding
 from design.flatten import Flattening, Limits, feasibility, flatten
@@ -112,7 +113,20 @@ def build(
     base, library, curve, wide = cells_on_offer(spec, library)
     flat = lay_flat(spec, mesh, curve, found)
     watch("choosing cells", 0.2)
-    placed, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)
+    flat, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)
+    if spec.compensate and curve is not None:
+        cut = np.array([kind == "cut" for kind in kinds_of(spec, tiling)])
+        wanted, choice = compensated(
+            flat,
+            tiling,
+            wanted,
+            choice,
+            cut,
+            library,
+            curve,
+            found,
+            lambda done: watch("compensating", 0.2 + 0.2 * done),
+        )
     hinge = hinges_mm(spec, choice, library)
     if curve is None and np.abs(hinge - base.sheet.hinge_mm).max() > HINGE_SAME_MM:
         choice, changed = as_cut(base, choice, hinge)
@@ -120,10 +134,10 @@ def build(
     found += contact_findings(spec, choice, library)
     watch("drawing slits", 0.4)
     cells = with_monostable(Cells(tiling, wanted, choice, hinge, kinds_of(spec, tiling)), library, found)
-    drawing, shift, labelled, parted = draw(spec, cells, library.sheet, placed)
-    found += sheet_findings(spec, drawing, placed, labelled, parted)
+    drawing, shift, labelled, parted = draw(spec, cells, library.sheet, flat)
+    found += sheet_findings(spec, drawing, flat, labelled, parted)
     cells = replace(cells, tiling=tiling.moved(shift))
-    placed = placed.moved_to(placed.flat_mm + shift)
+    placed = flat.moved_to(flat.flat_mm + shift)
     watch("ordering the cut", 0.5)
     options = JobOptions(tool=spec.tool, spread_mm=spec.spread_mm)
     job = compose_job(drawing, presets, options, remarks=[spec.name])

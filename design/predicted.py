@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,14 +13,18 @@ from numpy.typing import NDArray
 from design.cells.bending_map import bending_for
 from design.cells.library import CellLibrary
 from design.cells.select import Choice
+from design.deploy.equilibrium import from_flat, pushed_flat
 from design.deploy.indentation import Response, indentation_response
 from design.deploy.levels import Layout, sheet_layout, weld
 from design.deploy.predict import Deployed, deploy
+from design.deploy.search import same_shape
+from design.errors import NotConverged
 from design.findings import Finding
 from design.flatten import Flattening
 from design.pattern.tiling import Array, Tiling
 from design.spec import ResponseOptions
 
+FROM_FLAT_COUNT = 2000  # units up to which the free deployment is computed too, in a second or so
 THICKNESS_RATIO = 0.05  # thickness over edge further than that from the computed cells' is told
 
 
@@ -42,11 +47,7 @@ def predict(
     watch: Callable[[str, float], None],
 ) -> Predicted:
     """Return what the shell model says of the cells on their sheet. Raises `NotConverged` where it finds no shape."""
-    layout, design_mm = layout_of(tiling, choice, cut, library), lifted(flat, tiling.vertices_mm)
-    if tiling.twins is not None:
-        right = np.flatnonzero(tiling.twins != np.arange(len(tiling.twins)))
-        layout = weld(layout, np.column_stack([tiling.twins[right], right]))
-        design_mm = np.delete(design_mm, right, axis=0)
+    layout, design_mm = welded(layout_of(tiling, choice, cut, library), tiling, lifted(flat, tiling.vertices_mm))
     deployed = deploy(layout, flat.mesh, design_mm)
     watch("pressing the indenter", 0.8)
     response = indentation_response(
@@ -58,7 +59,41 @@ def predict(
         None if options.point_mm is None else np.array(options.point_mm),
         watch=lambda share: watch("pressing the indenter", 0.8 + 0.2 * share),
     )
-    return Predicted(deployed, response, tuple(_doubts(library)))
+    return Predicted(deployed, response, (*_doubts(library), *_other_side(layout, deployed, tiling.twins is not None)))
+
+
+def _other_side(layout: Layout, deployed: Deployed, is_tube: bool) -> list[Finding]:
+    """Return what the sheet does when it is left to itself: from flat it may pop to another shape than the intended.
+
+    The prediction starts from the target, as if every bump were helped to its side. Left out for large sheets and
+    tubes, which have no flat start.
+    """
+    if len(layout.cells) > FROM_FLAT_COUNT or is_tube:
+        return []
+    energies = []
+    for side in (0.3, -0.3):
+        try:
+            free = from_flat(layout, functools.partial(pushed_flat, side=side))
+        except NotConverged:
+            continue
+        if same_shape(free.x_mm, deployed.equilibrium.x_mm):
+            return []
+        energies.append(free.energy_mJ)
+    if not energies:
+        return []
+    text = (
+        f"left to itself the flat sheet pops to another shape, of {min(energies):.4g} mJ; "
+        f"the one predicted has {deployed.equilibrium.energy_mJ:.4g} mJ and needs its bumps helped to their sides"
+    )
+    return [Finding("DEPLOY-SIDES", text, "warning", hint="`fabctl deploy DESIGN --shapes 4` lists the shapes found")]
+
+
+def welded(layout: Layout, tiling: Tiling, design_mm: Array) -> tuple[Layout, Array]:
+    """Return the layout with the tiling's seam joined, and the places of the vertices that are left, `(n, 3)`."""
+    if tiling.twins is None:
+        return layout, design_mm
+    right = np.flatnonzero(tiling.twins != np.arange(len(tiling.twins)))
+    return weld(layout, np.column_stack([tiling.twins[right], right])), np.delete(design_mm, right, axis=0)
 
 
 def _doubts(library: CellLibrary) -> list[Finding]:

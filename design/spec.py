@@ -56,4 +56,5 @@ class DesignSpec:
     tool: ToolOptions = field(default_factory=ToolOptions)
     spread_mm: float = 0.0
     bed_mm: tuple[float, float] | None = None
+    compensate: bool = False  # change expansions so that the sheet at rest, bent, meets the target
     response: ResponseOptions | None = field(default_factory=ResponseOptions)

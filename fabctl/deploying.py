@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 from design.bundle import open_bundle
 from design.cells.bending_map import bending_for
 from design.cells.hinges import with_hinge
+from design.cells.homogenise import CURVE_SHARES
+from design.cells.library import CellLibrary, hexagon_mm2
 from design.cells.sheet import Sheet
+from design.deploy.cascade import Wells
 from design.deploy.designed import lift
 from design.deploy.levels import Layout, sheet_layout
 from design.deploy.shell import Reals
@@ -37,6 +40,9 @@ class Laid:
     target: TriMesh
     design_mm: Reals | None  # (n, 3) where each vertex belongs, where the folder tells
     sheet: Sheet
+    t_mm: Reals  # (m,) of each cell
+    theta_rad: Reals
+    library: CellLibrary  # of this sheet
 
 
 def read_laid(folder: Path, home: Path) -> Laid:
@@ -74,7 +80,20 @@ def read_laid(folder: Path, home: Path) -> Laid:
     goal = None
     if len(paper.faces) == len(target.faces):
         goal = lift(flat, paper.vertices_mm[:, :2], paper.faces, target.vertices_mm, target.faces)
-    return Laid(sheet_layout(flat, shape.faces, expansion, Y, nu, D), shape.vertices_mm, target, goal, sheet)
+    layout = sheet_layout(flat, shape.faces, expansion, Y, nu, D)
+    return Laid(layout, shape.vertices_mm, target, goal, sheet, t, theta, library)
+
+
+def wells_of(laid: Laid) -> Wells:
+    """Return each cell's whole energy curve; raise `RefusedError` where a cell has no second state."""
+    if np.any(laid.layout.expansion_ratio <= 1):
+        fault = Finding("CASCADE-SOLID", "some cells are not cut or spring back", hint="they have no two wells to snap")
+        raise RefusedError("the sheet cannot be opened cell by cell", [fault])
+    curves = [laid.library.energy_curve(float(t), float(a)) for t, a in zip(laid.t_mm, laid.theta_rad, strict=True)]
+    energy = np.array([curve.energy_mJ for curve in curves]) / hexagon_mm2(laid.sheet)
+    inner = CURVE_SHARES < 1
+    saddle = CURVE_SHARES[inner][np.argmax(energy[:, inner], axis=1)]
+    return Wells(CURVE_SHARES, energy, saddle)
 
 
 def _edge_mm(centre_mm: Reals) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass
+from dataclasses import replace as changed
 from pathlib import Path
 
 import numpy as np
@@ -104,12 +105,32 @@ def build_folder(
     cell_mm: float | None = None,
     replace: bool = False,
     emit: Emit = silent,
+    compensate: bool = False,
 ) -> tuple[Design, Bundle]:
     """Build the specification called `name` into `folder`; return the design and its folder."""
     inputs = read_inputs(name, home, target, cell_mm)
+    if compensate:
+        inputs = changed(inputs, spec=changed(inputs.spec, compensate=True))
     design = design_of(inputs, emit)
     emit(Event("progress", "writing the design folder", 0.99))
     return design, write_bundle(design, inputs.text, folder, replace)
+
+
+def build_compensated(bundle: Bundle, folder: Path, home: Path, emit: Emit = silent) -> tuple[Design, Finding]:
+    """Build a design folder anew with compensated expansions; raise `RefusedError` where they do not help.
+
+    The specification kept in the new folder asks for the compensation itself, so that it can be built from there.
+    """
+    spec_path, target = bundle.file("spec.yaml"), bundle.file("target.ply")
+    cell_mm = bundle.manifest["facts"].get("cell_mm")  # the command line may have asked for other cells than the file
+    inputs = read_inputs(str(spec_path), home, target, cell_mm)
+    design = design_of(changed(inputs, spec=changed(inputs.spec, compensate=True)), emit)
+    told = next((f for f in design.findings if f.code in ("COMPENSATED", "COMPENSATE-NOT")), None)
+    if told is None or told.code == "COMPENSATE-NOT":
+        raise RefusedError("the design was not compensated", [told] if told else [])
+    text = re.sub(r"(?m)^compensate:.*\n", "", inputs.text).rstrip("\n") + "\ncompensate: true\n"
+    write_bundle(design, text, folder)
+    return design, told
 
 
 def read_target(config: SpecConfig, folder: Path, target: Path | None) -> tuple[TriMesh, list[Finding]]:

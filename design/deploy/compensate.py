@@ -48,8 +48,11 @@ def compensate(
     loads: Sequence[Load] = (),
     fixed: NDArray[np.bool_] | None = None,
     watch: Callable[[float], None] | None = None,
+    changeable: NDArray[np.bool_] | None = None,
 ) -> Compensation:
     """Return the layout with the expansions that bring its vertices nearest to `goal_mm` `(n, 3)`.
+
+    Only units that are `changeable` `(m,)` are touched (by default all): solid ones have no expansion to choose.
 
     Without `fixed` degrees of freedom the shape may be moved rigidly; with them it is compared where it stands, and
     they keep their values of `start_mm`. Expansions stay within `bounds_ratio`, those of the library. Stiffness stays
@@ -60,10 +63,21 @@ def compensate(
     before = best = _misfit(found.x_mm, goal_mm, fixed)[0]
     current, damping, rounds = layout, 1e-3, 0
     roughness = _roughness(layout.cells)
+    free = np.ones(len(layout.cells), dtype=bool) if changeable is None else changeable
     for rounds in range(1, ROUNDS + 1):
         try:
             trial, rest, misfit, damping = _better(
-                current, found, goal_mm, bounds_ratio, loads, fixed, roughness, layout.expansion_ratio, damping, best
+                current,
+                found,
+                goal_mm,
+                bounds_ratio,
+                loads,
+                fixed,
+                roughness,
+                layout.expansion_ratio,
+                damping,
+                best,
+                free,
             )
         except NotConverged:
             break
@@ -74,7 +88,7 @@ def compensate(
         if gain < GAIN_RATIO * best:
             break
     lam = current.expansion_ratio
-    stopped = int(np.sum((lam <= bounds_ratio[0]) | (lam >= bounds_ratio[1])))
+    stopped = int(np.sum(free & ((lam <= bounds_ratio[0]) | (lam >= bounds_ratio[1]))))
     change = float(np.abs(lam - layout.expansion_ratio).max())
     return Compensation(current, found, before, best, change, stopped, rounds, best < 0.9 * before)
 
@@ -82,6 +96,7 @@ def compensate(
 def _better(
     layout: Layout, rest: Equilibrium, goal: Reals, bounds: tuple[float, float], loads: Sequence[Load],
     fixed: NDArray[np.bool_] | None, roughness: sp.csr_matrix, original: Reals, damping: float, best: float,
+    free: NDArray[np.bool_],
 ) -> tuple[Layout, Equilibrium, float, float]:  # fmt: skip
     """Return a layout with less misfit, its rest, misfit and the damping to go on with; raise where there is none."""
     moves = _sensitivity(layout, rest.x_mm, loads, fixed)
@@ -93,8 +108,9 @@ def _better(
     smooth = SMOOTH_FRAC * size * roughness.toarray()
     pull = moves.T @ gap.ravel() + smooth @ (layout.expansion_ratio - original)
     for _ in range(8):
-        step = -np.linalg.solve(normal + smooth + damping * size * np.eye(len(normal)), pull)
-        wanted = np.clip(layout.expansion_ratio + step, *bounds)
+        damped = (normal + smooth + damping * size * np.eye(len(normal)))[np.ix_(free, free)]
+        wanted = layout.expansion_ratio.copy()
+        wanted[free] = np.clip(wanted[free] - np.linalg.solve(damped, pull[free]), *bounds)
         trial = replace(layout, expansion_ratio=wanted)
         try:
             found = solve(System(trial.shell()), rest.x_mm, loads, fixed, iterations_max=60)

@@ -29,19 +29,47 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
+def well(s: float, lam: float, kd: float, shares: Array, curve: Array) -> tuple[float, float, float]:
+    """Return energy per area of an even stretch s and its first two slopes: ½k_d(s − λ)², or a whole curve if given.
+
+    `curve` `(k − 1, 4)` are a spline's coefficients over `shares` `(k,)` of the way from flat to λ, highest power
+    first; beyond its ends it goes on as a parabola.
+    """
+    if len(curve) == 0:
+        return 0.5 * kd * (s - lam) ** 2, kd * (s - lam), kd
+    span = lam - 1.0
+    share = (s - 1.0) / span
+    inside = min(max(share, shares[0]), shares[-1])
+    at = 0
+    while at < len(curve) - 1 and inside > shares[at + 1]:
+        at += 1
+    t = inside - shares[at]
+    a, b, c, d = curve[at, 0], curve[at, 1], curve[at, 2], curve[at, 3]
+    energy, slope, bend = ((a * t + b) * t + c) * t + d, (3 * a * t + 2 * b) * t + c, 6 * a * t + 2 * b
+    beyond = share - inside
+    if beyond != 0.0:
+        bend = max(bend, kd * span * span)
+        energy += slope * beyond + 0.5 * bend * beyond * beyond
+        slope += bend * beyond
+    return energy, slope / span, bend / (span * span)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
 def membrane(
-    x: Array, cells: Array, area: Array, cot: Array, lam: Array, kd: Array, ks: Array,
+    x: Array, cells: Array, area: Array, cot: Array, lam: Array, kd: Array, ks: Array, shares: Array, curves: Array,
     slots: Array, stride: Array, gradient: Array, hessian: Array, want: int,
 ) -> float:  # fmt: skip
     """Add the in-plane energy; return it.
 
     Per unit k_s(½Σ½cot|e|² − a) + ½k_d A(√(a/A) − λ)², a the present area: equal to A[½k_d(s−λ)² + ½k_s(σ1−σ2)²].
+    Where `curves` `(m, k − 1, 4)` has rows, the first term is A·(that curve) instead: see `well`.
     `want` 0: energy only, 1: and gradient, 2: and Hessian.
     """
     total = 0.0
     e = np.empty((3, 3))
     normal = np.empty(3)
     da = np.empty((3, 3))
+    none = np.empty((0, 4))
     for t in range(len(cells)):
         i0, i1, i2 = cells[t, 0], cells[t, 1], cells[t, 2]
         for c in range(3):
@@ -55,13 +83,14 @@ def membrane(
         s = np.sqrt(ratio)
         k = 0.25 * ks[t]
         dirichlet = cot[t, 0] * _dot(e[0], e[0]) + cot[t, 1] * _dot(e[1], e[1]) + cot[t, 2] * _dot(e[2], e[2])
-        total += k * dirichlet - ks[t] * a + 0.5 * kd[t] * area[t] * (s - lam[t]) ** 2
+        psi, rise, bend = well(s, lam[t], kd[t], shares, curves[t] if len(curves) else none)
+        total += k * dirichlet - ks[t] * a + area[t] * psi
         if want == 0:
             continue
         inv = 1.0 / max(twice, 1e-300)
         for c in range(3):
             normal[c] *= inv
-        slope = 0.5 * kd[t] * (1.0 - lam[t] / s) - ks[t]
+        slope = 0.5 * rise / s - ks[t]
         for i in range(3):
             _cross(normal, e[i], da[i])
             j, l = (i + 1) % 3, (i + 2) % 3
@@ -71,7 +100,7 @@ def membrane(
                 gradient[cells[t, i], c] += slope * da[i, c] + pull
         if want == 1:
             continue
-        curve = 0.25 * kd[t] * lam[t] / (area[t] * s * ratio)
+        curve = 0.25 * (bend * s - rise) / (area[t] * s * ratio)
         for i in range(3):
             for j in range(3):
                 start = slots[t, i, j]

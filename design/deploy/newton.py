@@ -115,7 +115,7 @@ class System:
         data = np.zeros(len(self._indices) if want == 2 else 1)
         total = kernels.membrane(
             x, s.cells, s.area_mm2, s.cotangents_ratio, s.expansion_ratio, s.dilation_N_mm, s.shear_N_mm,
-            self._cell_slots, self.stride, gradient, data, want,
+            s.well_shares_ratio, s.wells_mJ_mm2, self._cell_slots, self.stride, gradient, data, want,
         )  # fmt: skip
         total += kernels.bending(
             x, s.hinges, s.fold_mJ, s.rest_angle_rad, self._hinge_slots, self.stride, gradient, data, want

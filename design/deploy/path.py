@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -47,3 +47,11 @@ def _laid(x: Reals, like: Reals) -> Reals:
 
     rotation, shift = kabsch(x, like)
     return np.asarray(x @ rotation.T + shift)
+
+
+def followed(frames_mm: Sequence[Reals], end_mm: Reals) -> list[Reals]:
+    """Return shapes moved rigidly: the last one onto `end_mm`, each earlier one onto the one after it."""
+    laid = [_laid(frames_mm[-1], end_mm)]
+    for x in frames_mm[-2::-1]:
+        laid.append(_laid(x, laid[-1]))
+    return laid[::-1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -11,9 +12,12 @@ from design.deploy.compare import kabsch
 from design.deploy.equilibrium import from_flat, pushed_flat, solve_level
 from design.deploy.levels import Layout
 from design.deploy.newton import Equilibrium
-from design.deploy.shell import Reals
+from design.deploy.shell import Ints, Reals, neighbours
 from design.errors import NotConverged
 
+BUMP_HEIGHT_RATIO = 0.5  # of a bump's width: how far it is pushed through, well past flat
+SMALLEST_BUMP_COUNT = 4  # units
+MOST_BUMPS_COUNT = 12  # the largest ones are turned over
 SAME_RATIO = 0.01  # of the sheet's size, RMS after alignment: nearer than that is the same shape
 
 
@@ -48,6 +52,49 @@ def _bulge(waves: Reals, phases: Reals, heights: Reals) -> Callable[[Layout], Re
     return start
 
 
+def bumps(layout: Layout) -> list[Ints]:
+    """Return the groups of units `(k,)` that become domes or bowls, largest first.
+
+    A sheet of expansion λ takes the Gaussian curvature −Δ log λ/λ², whose sign tells domes from saddles; which way a
+    dome stands the expansions do not say.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    across = neighbours(layout.cells)
+    beside, height = across >= 0, np.log(layout.expansion_ratio)
+    for _ in range(2):  # one unit's neighbours are too near to tell curvature from noise
+        height = (height + np.sum(np.where(beside, height[across], 0), axis=1)) / (1 + beside.sum(axis=1))
+    domed = np.sum(np.where(beside, height[across] - height[:, None], 0), axis=1) < 0
+    one, side = np.nonzero(beside & domed[:, None] & domed[across])
+    graph = coo_matrix((np.ones(len(one)), (one, across[one, side])), shape=(len(domed), len(domed)))
+    _, part = connected_components(graph, directed=False)
+    groups = [np.flatnonzero((part == k) & domed) for k in np.unique(part[domed])]
+    groups = [group for group in groups if len(group) >= SMALLEST_BUMP_COUNT]
+    return sorted(groups, key=len, reverse=True)[:MOST_BUMPS_COUNT]
+
+
+def turned_over(layout: Layout, x_mm: Reals, bump: Ints, side: float) -> Reals:
+    """Return the shape `(n, 3)` with a bump pushed along the surface's normal, to `side` (±1)."""
+    flat, centre = layout.flat_mm(), layout.corners_mm[bump].mean(axis=(0, 1))
+    width = float(np.sqrt(len(bump) * np.sqrt(0.1875)) * layout.edge_mm)
+    a, b, c = (x_mm[layout.cells[bump, k]] for k in range(3))
+    normal = np.cross(b - a, c - a).sum(axis=0)
+    normal /= np.linalg.norm(normal)
+    near = np.exp(-2 * np.sum((flat - centre) ** 2, axis=1) / width**2)
+    stretch = float(layout.expansion_ratio[bump].mean())
+    return np.asarray(x_mm + side * BUMP_HEIGHT_RATIO * stretch * width * near[:, None] * normal)
+
+
+def _designed_starts(layout: Layout, design_mm: Reals) -> dict[str, Reals]:
+    """Return the intended shape, and the same with one bump after the other pushed to either side."""
+    named = {"designed": design_mm}
+    for k, bump in enumerate(bumps(layout)):
+        for side, word in ((1.0, "up"), (-1.0, "down")):
+            named[f"designed, bump {k + 1} {word}"] = turned_over(layout, design_mm, bump, side)
+    return named
+
+
 def equilibria(
     layout: Layout,
     design_mm: Reals | None = None,
@@ -57,27 +104,24 @@ def equilibria(
 ) -> tuple[list[Found], list[str]]:
     """Return the different stable equilibria found, lowest energy first, and the starts that led nowhere.
 
-    Starts are the designed shape (where its points `(n, 3)` are given) and those of `starts`. A shape and its mirror
+    Starts are the designed shape (where its points `(n, 3)` are given), the same with each bump turned over, and those
+    of `starts`. A shape and its mirror
     image are two, unless turning makes them one.
     """
     found: list[Found] = []
     lost: list[str] = []
-    named = starts(layout, count, seed)
-    total = len(named) + (design_mm is not None)
-    if design_mm is not None:
+    near = {} if design_mm is None else _designed_starts(layout, design_mm)
+    ways: dict[str, Callable[[], Equilibrium]] = {
+        name: functools.partial(solve_level, layout, x) for name, x in near.items()
+    }
+    ways |= {name: functools.partial(from_flat, layout, start) for name, start in starts(layout, count, seed).items()}
+    for k, (name, way) in enumerate(ways.items()):
         try:
-            _keep(found, solve_level(layout, design_mm), "designed")
-        except NotConverged as fault:
-            lost.append(f"designed: {fault}")
-        if watch is not None:
-            watch(1 / total, "designed")
-    for k, (name, start) in enumerate(named.items()):
-        try:
-            _keep(found, from_flat(layout, start), name)
+            _keep(found, way(), name)
         except NotConverged as fault:
             lost.append(f"{name}: {fault}")
         if watch is not None:
-            watch((k + 1 + (design_mm is not None)) / total, name)
+            watch((k + 1) / len(ways), name)
     return sorted(found, key=lambda one: one.equilibrium.energy_mJ), lost
 
 

@@ -7,7 +7,7 @@ interior edge resists folding. Pure data; `kernels` computes with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +33,8 @@ class Shell:
     fold_mJ: Reals  # (h,) energy is ½·fold·(θ − θ0)²
     rest_angle_rad: Reals  # (h,)
     edges: Ints  # (e, 2) every edge once, lower vertex first
+    well_shares_ratio: Reals = field(default_factory=lambda: np.zeros(0))  # (k,) of the way from flat to λ
+    wells_mJ_mm2: Reals = field(default_factory=lambda: np.zeros((0, 0, 4)))  # (m, k − 1, 4) splines; none: parabolas
 
     @property
     def scale_N(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 @click.option("--friction", type=click.FloatRange(0), default=0.5, show_default=True, help="Coefficient for coulomb.")
 @click.option("--level-floor", is_flag=True, help="A level floor instead of a bed made to the rim.")
 @click.option("--shapes", type=click.IntRange(0), default=0, help="Look for other equilibria from this many starts.")
+@click.option("--compensate", is_flag=True, help="Build DESIGN-compensated: other expansions, nearer to the target.")
+@click.option("--cascade", "by_unit", is_flag=True, help="Open the sheet from flat, one unit after the other.")
 @click.option("--animation/--no-animation", default=True, help="Write the deployment as an animated picture.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder to write into [DESIGN-deployed].")
 @json_option
@@ -39,6 +42,8 @@ def command(
     friction: float,
     level_floor: bool,
     shapes: int,
+    compensate: bool,
+    by_unit: bool,
     animation: bool,
     output: Path | None,
     as_json: bool,
@@ -58,9 +63,14 @@ def command(
         emit(Event("stage", f"its weight acts; rim: {support}"))
         settled = settle(laid.layout, popped.mesh.vertices_mm, laid.sheet, support, friction, not level_floor)
     folder = output or design.with_name(design.name + "-deployed")
-    facts = {**_facts(popped), **_sag(settled, support)}
+    facts = {**_facts(popped), **_softest(laid, popped), **_sag(settled, support)}
     if shapes:
         facts["shapes"] = _shapes(laid, shapes, emit)
+    if compensate:
+        facts["compensated"] = _compensated(design, emit)
+    folder.mkdir(parents=True, exist_ok=True)
+    if by_unit:
+        facts["cascade"] = _cascade(laid, folder, popped, animation, emit)
     facts["folder"] = str(folder)
     _write(folder, laid, popped, settled, animation, facts)
     show(facts, as_json, _lines(facts))
@@ -80,6 +90,14 @@ def _facts(popped: Deployed) -> dict[str, Any]:
         "residual_ratio": rest.residual_ratio,
         "iterations_count": rest.iterations_count,
     }
+
+
+def _softest(laid: Laid, popped: Deployed) -> dict[str, Any]:
+    """Return how far the shape is from giving way: the smallest stiffness of any small motion, rigid ones held."""
+    from design.deploy.newton import System, smallest_eigenvalue_N_mm
+
+    system = System(laid.layout.shell())
+    return {"smallest_eigenvalue_N_mm": smallest_eigenvalue_N_mm(system, popped.equilibrium.x_mm, (), None)}
 
 
 def _sag(settled: Settled | None, support: str) -> dict[str, Any]:
@@ -118,6 +136,58 @@ def _shapes(laid: Laid, count: int, emit: Emit) -> list[dict[str, Any]]:
     return rows
 
 
+def _cascade(laid: Laid, folder: Path, popped: Deployed, animation: bool, emit: Emit) -> dict[str, Any]:
+    """Open the sheet unit by unit; write every step into `cascade.csv` and the way as an animation."""
+    from design.deploy.cascade import cascade, cascade_csv
+    from design.deploy.path import followed
+    from design.deploy.predict import compared
+    from fabctl.deploying import animation_gif, wells_of
+    from fabctl.events import Event
+    from fabctl.records.folder import write_atomically
+
+    found = cascade(
+        laid.layout,
+        wells_of(laid),
+        intended_mm=popped.mesh.vertices_mm,
+        watch=lambda done: emit(Event("progress", "opening unit after unit", done)),
+    )
+    write_atomically(folder / "cascade.csv", cascade_csv(found))
+    if animation:
+        gif = animation_gif(followed(found.frames_mm, popped.mesh.vertices_mm), popped.mesh, "opened unit by unit")
+        (folder / "cascade.gif").write_bytes(gif)
+    end = replace(popped.equilibrium, x_mm=found.x_mm)
+    off = compared(laid.layout, end, laid.target, laid.design_mm).deviation
+    return {
+        "pulled_count": len(found.steps) + len(found.failed),
+        "stayed_count": sum(step.stays for step in found.steps),
+        "taken_along_count": sum(len(step.opened) for step in found.steps),
+        "snapped_back_count": sum(len(step.closed) for step in found.steps),
+        "open_count": int(found.is_open.sum()),
+        "failed": list(found.failed),
+        "energy_mJ": found.energy_mJ,
+        "stable": found.stable,
+        "residual_ratio": found.residual_ratio,
+        "deviation_mean_mm": off.mean_mm,
+    }
+
+
+def _compensated(design: Path, emit: Emit) -> dict[str, Any]:
+    """Build the same design with compensated expansions beside it; refuse where that does not help."""
+    from design.bundle import open_bundle
+    from fabctl.designing import build_compensated
+
+    bundle = open_bundle(design)
+    folder = design.with_name(design.name + "-compensated")
+    built, told = build_compensated(bundle, folder, lab().root, emit)
+    off = None if built.predicted is None else built.predicted.deployed.deviation
+    return {
+        "folder": str(folder),
+        "told": told.message,
+        "deviation_rms_mm": None if off is None else off.rms_mm,
+        "points_rms_mm": None if off is None else off.points_rms_mm,
+    }
+
+
 def _write(
     folder: Path, laid: Laid, popped: Deployed, settled: Settled | None, animation: bool, facts: dict[str, Any]
 ) -> None:
@@ -142,7 +212,8 @@ def _lines(facts: dict[str, Any]) -> list[str]:
     lines = [
         f"{facts['units_count']} units: {facts['deviation_mean_mm']:.2f} mm from the target on average "
         f"({facts['deviation_mean_frac']:.2%} of its diagonal), {facts['deviation_max_mm']:.2f} mm at most",
-        f"{'stable' if facts['stable'] else 'not stable'}; residual {facts['residual_ratio']:.1e} "
+        f"{'stable' if facts['stable'] else 'not stable'} "
+        f"(smallest eigenvalue {facts['smallest_eigenvalue_N_mm']:.1e} N/mm); residual {facts['residual_ratio']:.1e} "
         f"after {facts['iterations_count']} iterations",
     ]
     if "sag_mm" in facts:
@@ -155,4 +226,13 @@ def _lines(facts: dict[str, Any]) -> list[str]:
             f"shape of {shape['energy_mJ']:.4f} mJ: {shape['deviation_mean_mm']:.2f} mm from the target "
             f"({', '.join(shape['starts'])})"
         )
+    if "cascade" in facts:
+        way = facts["cascade"]
+        lines.append(
+            f"opened unit by unit: {way['open_count']} of {facts['units_count']} open at the end, "
+            f"{way['taken_along_count']} taken along, {way['snapped_back_count']} snapped back, "
+            f"{len(way['failed'])} without an answer; {way['deviation_mean_mm']:.2f} mm from the target"
+        )
+    if "compensated" in facts:
+        lines.append(f"{facts['compensated']['folder']}: {facts['compensated']['told']}")
     return [*lines, f"written to {facts['folder']}"]

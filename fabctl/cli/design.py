@@ -22,9 +22,16 @@ def command() -> None:
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell, instead of the specification's.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Design folder to write [out/NAME].")
 @click.option("--replace", is_flag=True, help="Replace a design that lies in that folder.")
+@click.option("--compensate", is_flag=True, help="Change the expansions so that the bent sheet meets the target.")
 @json_option
 def build(
-    spec: str, target: Path | None, cell_mm: float | None, output: Path | None, replace: bool, as_json: bool
+    spec: str,
+    target: Path | None,
+    cell_mm: float | None,
+    output: Path | None,
+    replace: bool,
+    compensate: bool,
+    as_json: bool,
 ) -> None:
     """Build the design folder of SPEC, a YAML file or a name in configs/specs."""
     from design.bundle import facts
@@ -33,7 +40,7 @@ def build(
 
     home = lab().root
     folder = output or home / "out" / load_spec(spec, home)[0].name
-    design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress())
+    design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress(), compensate)
     for finding in design.findings:
         say(str(finding))
     numbers = facts(design)

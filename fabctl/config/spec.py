@@ -149,6 +149,7 @@ class SpecConfig(Model):
     border: BorderConfig = BorderConfig()
     tool: ToolConfig = ToolConfig()
     bed_mm: tuple[Positive, Positive] | None = None
+    compensate: bool = False
     response: ResponseConfig | None = ResponseConfig()
 
     @model_validator(mode="after")
@@ -189,6 +190,7 @@ class SpecConfig(Model):
             tool=ToolOptions(kerf_mm=self.tool.kerf_mm or kerf_mm, **tool),
             spread_mm=self.tool.spread_mm,
             bed_mm=self.bed_mm,
+            compensate=self.compensate,
             response=ResponseOptions(**self.response.model_dump()) if self.response else None,
         )
 

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from design.bundle import open_bundle
 from design.errors import BundleError
 from design.meshfiles import read_mesh
 from fabctl.cli.deploy import command
 from fabctl.deploying import read_laid
-from fabctl.designing import build_folder
+from fabctl.designing import build_compensated, build_folder
+from fabctl.errors import RefusedError
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +40,7 @@ def test_deploying_a_design_writes_shape_pictures_and_numbers(folder: Path, tmp_
     assert ran.exit_code == 0
     told = json.loads(ran.stdout)
     assert told["stable"] is True
+    assert told["smallest_eigenvalue_N_mm"] > 0
     assert told["residual_ratio"] < 1e-8
     assert told["loaded_residual_ratio"] < 1e-8
     assert 0 < told["sag_mm"] < 5
@@ -70,3 +73,46 @@ def test_cells_that_do_not_stay_open_are_solid_as_in_the_builds_prediction(tmp_p
     solid_N_mm = laid.sheet.E_MPa * laid.sheet.thickness_mm
     assert laid.layout.Y_N_mm[closed] == pytest.approx(solid_N_mm)
     assert (laid.layout.Y_N_mm[~closed] < solid_N_mm).all()
+
+
+def test_a_compensated_folder_is_nearer_to_its_target_and_says_so(tmp_path: Path) -> None:
+    text = "name: x\ntarget: {make: cap, radius_mm: 60, edge_mm: 5}\nresponse: {steps_count: 4, depth_mm: 2}\n"
+    (tmp_path / "x.yaml").write_text(text)
+    plain, _ = build_folder(str(tmp_path / "x.yaml"), tmp_path / "x", tmp_path)
+    words = [str(tmp_path / "x"), "--compensate", "--no-animation", "--json", "-o", str(tmp_path / "popped")]
+    ran = CliRunner().invoke(command, words, obj=str(tmp_path), catch_exceptions=False)
+    assert ran.exit_code == 0, ran.output
+    told = json.loads(ran.stdout)["compensated"]
+    assert plain.predicted is not None
+    assert told["points_rms_mm"] < 0.9 * plain.predicted.deployed.deviation.points_rms_mm
+    assert "before" in told["told"]
+    folder = Path(told["folder"])
+    assert "compensate: true" in (folder / "spec.yaml").read_text()
+    assert read_laid(folder, tmp_path).layout.expansion_ratio == pytest.approx(
+        read_laid(tmp_path / "x", tmp_path).layout.expansion_ratio, abs=0.2
+    )
+    with pytest.raises(BundleError, match="exists already"):
+        build_compensated(open_bundle(tmp_path / "x"), folder, tmp_path)
+
+
+def test_a_sheet_that_compensation_does_not_help_is_refused(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("design.compensated.HELPS_RATIO", 0.0)
+    text = "name: x\ntarget: {make: cap, radius_mm: 60, edge_mm: 5}\nresponse: {steps_count: 4, depth_mm: 2}\n"
+    (tmp_path / "x.yaml").write_text(text)
+    _, bundle = build_folder(str(tmp_path / "x.yaml"), tmp_path / "x", tmp_path)
+    with pytest.raises(RefusedError) as refused:
+        build_compensated(bundle, tmp_path / "y", tmp_path)
+    assert [finding.code for finding in refused.value.findings] == ["COMPENSATE-NOT"]
+    assert not (tmp_path / "y").exists()
+
+
+def test_a_design_is_opened_unit_by_unit(folder: Path, tmp_path: Path) -> None:
+    words = [str(folder), "--cascade", "--json", "-o", str(tmp_path)]
+    ran = CliRunner().invoke(command, words, obj=str(folder.parent), catch_exceptions=False)
+    assert ran.exit_code == 0, ran.output
+    told = json.loads(ran.stdout)
+    way = told["cascade"]
+    assert way["residual_ratio"] < 1e-8
+    assert 0 < way["open_count"] <= told["units_count"]
+    assert len((tmp_path / "cascade.csv").read_text().splitlines()) == 1 + way["pulled_count"] - len(way["failed"])
+    assert (tmp_path / "cascade.gif").read_bytes()[:4] == b"GIF8"

@@ -1,0 +1,66 @@
+"""Cells chosen so that the sheet at rest meets its target: what bending takes away is given beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from design.cells.library import CellLibrary
+from design.cells.select import Choice, SelectionCurve, on_curve
+from design.deploy.compare import kabsch
+from design.deploy.compensate import compensate
+from design.deploy.equilibrium import solve_level
+from design.deploy.levels import Layout
+from design.deploy.shell import Reals
+from design.errors import NotConverged
+from design.findings import Finding
+from design.flatten import Flattening
+from design.pattern.tiling import Array, Tiling
+from design.predicted import layout_of, lifted, welded
+
+HELPS_RATIO = 0.9  # of the misfit before; a sheet that gains less than a tenth is left as it was
+
+
+def compensated(
+    flat: Flattening,
+    tiling: Tiling,
+    wanted_ratio: Array,
+    choice: Choice,
+    cut: NDArray[np.bool_],
+    library: CellLibrary,
+    curve: SelectionCurve,
+    found: list[Finding],
+    watch: Callable[[float], None],
+) -> tuple[Array, Choice]:
+    """Return what each cell must expand by and the cells for it; those given where other ones do not help.
+
+    The misfit told is that of the cells chosen anew, with their own stiffness, not that of the optimisation's model.
+    """
+    layout, goal = welded(layout_of(tiling, choice, cut, library), tiling, lifted(flat, tiling.vertices_mm))
+    try:
+        before_mm = points_rms_mm(layout, goal)
+        answer = compensate(layout, goal, curve.range_ratio(), watch=watch, changeable=cut)
+        asked = np.where(cut, answer.layout.expansion_ratio, wanted_ratio)
+        chosen = on_curve(curve, asked)
+        anew, goal = welded(layout_of(tiling, chosen, cut, library), tiling, lifted(flat, tiling.vertices_mm))
+        after_mm = points_rms_mm(anew, goal)
+    except NotConverged as fault:
+        found.append(Finding("COMPENSATE-NOT", f"the sheet was left as it was: {fault}", "warning"))
+        return wanted_ratio, choice
+    told = f"corresponding points {before_mm:.3f} mm from the target before, {after_mm:.3f} mm after (RMS)"
+    if after_mm > HELPS_RATIO * before_mm:
+        hint = "the library ends, or the target is met already"
+        found.append(Finding("COMPENSATE-NOT", f"compensation does not help: {told}", "warning", hint=hint))
+        return wanted_ratio, choice
+    told += f"; expansions changed by up to {answer.change_ratio:.4f}, {answer.at_bound_count} at the library's end"
+    found.append(Finding("COMPENSATED", told, "info"))
+    return asked, chosen
+
+
+def points_rms_mm(layout: Layout, goal_mm: Reals) -> float:
+    """Return the RMS distance of the free sheet's vertices from where they belong, rigidly aligned."""
+    x = solve_level(layout, goal_mm).x_mm
+    rotation, shift = kabsch(x, goal_mm)
+    return float(np.sqrt(np.mean(np.sum((x @ rotation.T + shift - goal_mm) ** 2, axis=1))))
