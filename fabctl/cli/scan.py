@@ -38,10 +38,15 @@ def command() -> None:
     help="The cloud's scale: found from geometry, given by --unit-mm, or taken from a measured board.",
 )
 @click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
-@click.option("--markers", type=FILE, help="Markers as scanned: label,x,y,z in cloud units.")
+@click.option(
+    "--markers",
+    type=FILE,
+    help="Markers as scanned: label,x,y,z in cloud units; without it they are looked for in the cloud's colours.",
+)
 @click.option("--board", type=FILE, help="The board as measured: label,x,y,z in mm.")
 @click.option("--datum", type=FILE, help="Three or more points as scanned: label,x,y,z in cloud units.")
 @click.option("--datum-target", type=FILE, help="The same points on the target: label,x,y,z in mm.")
+@click.option("--colours", type=FILE, help="Coloured PLY in the target's frame, e.g. an earlier scan's colours.ply.")
 @click.option(
     "--mode",
     type=click.Choice(["best-fit", "least-squares", "datum", "rim", "gravity-and-rim"]),
@@ -62,6 +67,7 @@ def run_scan(
     board: Path | None,
     datum: Path | None,
     datum_target: Path | None,
+    colours: Path | None,
     mode: str,
     tolerance_frac: float | None,
     seed: int,
@@ -87,6 +93,7 @@ def run_scan(
         "board": board,
         "datum_cloud": datum,
         "datum_target": datum_target,
+        "colours": colours,
         "mode": mode,
         "tolerance_frac": tolerance_frac,
         "seed": seed,

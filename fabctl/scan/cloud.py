@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from design.findings import Finding
 from fabctl.errors import RefusedError, UsageError
 from fabctl.scan.foreign import open3d
+from fabctl.scan.stream import Piece, draw, las_pieces, ply_header, ply_pieces, text_pieces
 
 Floats = NDArray[np.float64]
 
@@ -19,6 +21,7 @@ FORMATS = (".ply", ".obj", ".stl", ".pcd", ".xyz", ".txt", ".csv", ".las", ".laz
 LEAST_POINTS = 500
 MESH_SAMPLES = 300_000
 MOST_POINTS = 5_000_000
+RGB = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +48,8 @@ def read_cloud(path: Path, seed: int = 0, most: int = MOST_POINTS) -> Cloud:
     """Return the cloud in the file: PLY, OBJ, STL, PCD, XYZ text or LAS; meshes are sampled evenly.
 
     Raises `UsageError` for a file that is not there or not of these kinds, `RefusedError` with all findings for one
-    that holds nothing usable. More than `most` points are thinned at random, and a finding says so.
+    that holds nothing usable. More than `most` points are thinned at random, and a finding says so; files of points are
+    thinned while they are read.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such file")
@@ -54,31 +58,62 @@ def read_cloud(path: Path, seed: int = 0, most: int = MOST_POINTS) -> Cloud:
         raise UsageError(f"{path}: not a cloud this program reads (known: {', '.join(FORMATS)})")
     if path.stat().st_size == 0:
         raise RefusedError(f"{path}: cannot be compared", [Finding("SCAN-FILE", "the file is empty", where=str(path))])
+    header = ply_header(path) if kind == ".ply" else None
+    skipped: list[int] = []
     if kind in (".las", ".laz"):
-        found = _read_las(path)
+        found = _drawn(path, las_pieces(path), seed, most)
     elif kind in (".xyz", ".txt", ".csv"):
-        found = _read_text(path)
+        found = _drawn(path, text_pieces(path, skipped), seed, most)
+        if len(found.points) == 0 and not found.findings:
+            said = Finding("SCAN-TEXT", "no line holds three numbers", where=str(path), hint="one point a line: x y z")
+            raise RefusedError(f"{path}: cannot be compared", [said])
+        if sum(skipped) > 1:
+            lines = Finding("SCAN-LINES", f"{sum(skipped)} lines hold no point", level="warning")
+            found = replace(found, findings=(*found.findings, lines))
+    elif header is not None:
+        found = _drawn(path, ply_pieces(path, header), seed, most)
     else:
-        found = _read_open3d(path, kind, seed)
-    return _checked(found, seed, most)
+        found = _thinned(_read_open3d(path, kind, seed), seed, most)
+    return _checked(found)
 
 
-def _checked(cloud: Cloud, seed: int, most: int) -> Cloud:
+def _drawn(path: Path, pieces: Iterator[Piece], seed: int, most: int) -> Cloud:
+    """Return the cloud read a piece at a time, with what was left out of it."""
+    made = draw(pieces, most, seed)
+    findings = []
+    if made.not_numbers_count:
+        findings.append(_not_numbers(made.not_numbers_count))
+    usable = made.total_count - made.not_numbers_count
+    if len(made.points) < usable:
+        findings.append(_said_thinned(usable, len(made.points), seed, "while reading"))
+    return Cloud(made.points, made.normals, made.colours, path, tuple(findings))
+
+
+def _not_numbers(count: int) -> Finding:
+    return Finding("SCAN-NAN", f"{count} points are not numbers and were left out", level="warning")
+
+
+def _said_thinned(count: int, kept: int, seed: int, when: str) -> Finding:
+    said = f"{count} points were thinned to {kept} at random, evenly over the file, {when} (seed {seed})"
+    return Finding("SCAN-THINNED", said, level="info")
+
+
+def _thinned(cloud: Cloud, seed: int, most: int) -> Cloud:
+    """Return the cloud without what is no number, and with at most `most` points, with a finding for either."""
     findings = list(cloud.findings)
     finite = np.isfinite(cloud.points).all(axis=1)
     if not finite.all():
-        lost = int((~finite).sum())
-        findings.append(Finding("SCAN-NAN", f"{lost} points are not numbers and were left out", level="warning"))
+        findings.append(_not_numbers(int((~finite).sum())))
         cloud = cloud.take(finite)
     if len(cloud.points) > most:
-        findings.append(
-            Finding(
-                "SCAN-THINNED",
-                f"{len(cloud.points)} points were thinned to {most} at random (seed {seed})",
-                level="info",
-            )
-        )
+        findings.append(_said_thinned(len(cloud.points), most, seed, "after reading"))
         cloud = cloud.take(np.sort(np.random.default_rng(seed).permutation(len(cloud.points))[:most]))
+    return replace(cloud, findings=tuple(findings))
+
+
+def _checked(cloud: Cloud) -> Cloud:
+    """Return the cloud; raises `RefusedError` where nothing can be compared."""
+    findings = list(cloud.findings)
     if len(cloud.points) < LEAST_POINTS:
         count = len(cloud.points)
         findings.append(Finding("SCAN-FEW", f"{count} usable points; at least {LEAST_POINTS} are needed"))
@@ -86,7 +121,7 @@ def _checked(cloud: Cloud, seed: int, most: int) -> Cloud:
         findings.append(Finding("SCAN-POINT", "all points are the same"))
     if any(f.level == "error" for f in findings):
         raise RefusedError(f"{cloud.source}: cannot be compared", findings)
-    return replace(cloud, findings=tuple(findings))
+    return cloud
 
 
 def _read_open3d(path: Path, kind: str, seed: int) -> Cloud:
@@ -138,44 +173,25 @@ def _sampled(mesh: Any, path: Path, seed: int) -> Cloud:
     return Cloud(points, cross[face] / area[face, None], colours, path, (said,))
 
 
-def _read_text(path: Path) -> Cloud:
-    rows, skipped = [], 0
-    with path.open("rb") as stream:
-        for line in stream:
-            words = line.replace(b",", b" ").replace(b";", b" ").split()
-            try:
-                rows.append([float(w) for w in words[:6]])
-            except ValueError:
-                skipped += 1
-            else:
-                if len(rows[-1]) < 3:
-                    rows.pop()
-                    skipped += 1
-    if not rows:
-        raise RefusedError(
-            f"{path}: cannot be compared",
-            [Finding("SCAN-TEXT", "no line holds three numbers", where=str(path), hint="one point a line: x y z")],
-        )
-    points = np.array([row[:3] for row in rows])
-    findings = () if skipped <= 1 else (Finding("SCAN-LINES", f"{skipped} lines hold no point", level="warning"),)
-    return Cloud(points, None, None, path, findings)
+def read_painted(path: Path) -> tuple[Floats, NDArray[np.uint8] | None]:
+    """Return points and colours of a PLY file, its vertices where it is a mesh; no colours where it has none."""
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
+    o3d = open3d()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        read = o3d.io.read_point_cloud(str(path))
+    colours = np.round(255 * np.array(read.colors)).astype(np.uint8) if read.has_colors() else None
+    return np.array(read.points, dtype=np.float64).reshape(-1, 3), colours
 
 
-def _read_las(path: Path) -> Cloud:
-    import laspy
-
-    try:
-        read = laspy.read(path)
-    except (laspy.errors.LaspyException, OSError, ValueError) as fault:
-        raise RefusedError(
-            f"{path}: cannot be compared", [Finding("SCAN-LAS", f"not a LAS file: {fault}", where=str(path))]
-        ) from fault
-    points = np.array(read.xyz, dtype=np.float64)
-    colours = None
-    if "red" in read.point_format.dimension_names:
-        full = np.stack([np.asarray(read[k], dtype=np.int64) for k in ("red", "green", "blue")], axis=1)
-        colours = (full // 256 if len(full) and full.max() > 255 else full).astype(np.uint8)
-    return Cloud(points, None, colours, path)
+def write_painted(path: Path, points_mm: Floats, colours: NDArray[np.uint8]) -> None:
+    """Write points with the colours they were scanned in as binary PLY."""
+    table = np.zeros(len(points_mm), dtype=[(k, "<f4") for k in "xyz"] + [(k, "u1") for k in RGB])
+    table["x"], table["y"], table["z"] = points_mm.T
+    table["red"], table["green"], table["blue"] = colours.T
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property float {k}" for k in "xyz"] + [f"property uchar {k}" for k in RGB]
+    path.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode() + table.tobytes())
 
 
 def read_labelled(path: Path) -> dict[str, Floats]:

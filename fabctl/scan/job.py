@@ -16,14 +16,17 @@ from fabctl.errors import DONE, OUT_OF_TOLERANCE, REFUSED, UsageError
 from fabctl.events import Emit, Event, silent
 from fabctl.records.folder import RunFolder
 from fabctl.scan.clean import Cleaned, clean
-from fabctl.scan.cloud import Cloud, read_cloud, read_labelled, write_csv, write_ply
+from fabctl.scan.cloud import Cloud, read_cloud, read_labelled, read_painted, write_csv, write_painted, write_ply
 from fabctl.scan.colours import colours_of, span_mm
+from fabctl.scan.decide import Datums
 from fabctl.scan.deviation import Deviation, Statistics, Uncertainty, bootstrap, deviate, statistics
 from fabctl.scan.judge import Judged
 from fabctl.scan.markers import Scale, scale_from_board
 from fabctl.scan.modes import Mode, aligned_by
+from fabctl.scan.paint import Paint, paint_of, read_paint
+from fabctl.scan.painted import marks_on_table
 from fabctl.scan.refine import Options, refine
-from fabctl.scan.register import FINAL_POINTS, Datums, Registration, Task, register
+from fabctl.scan.register import FINAL_POINTS, Registration, Task, register
 from fabctl.scan.symmetry import Symmetries, find_symmetries
 from fabctl.scan.target import Target
 
@@ -31,6 +34,7 @@ Floats = NDArray[np.float64]
 ScaleChoice = Literal["free", "known", "markers"]
 Verdict = Literal["pass", "fail", "no tolerance given", "undecided"]
 
+PAINTED = 60_000  # points kept with their own colours, for later scans of the same specimen
 SHARE_WITHIN_FRAC = 0.95  # of the compared area must lie within the tolerance
 
 
@@ -47,6 +51,7 @@ class Request:
     board: Path | None = None  # label,x,y,z in mm
     datum_cloud: Path | None = None  # label,x,y,z in cloud units
     datum_target: Path | None = None  # label,x,y,z in mm, in the target's frame
+    colours: Path | None = None  # coloured PLY in the target's frame; without it the target's own colours, if any
     mode: Mode = "best-fit"
     tolerance_frac: float | None = None
     seed: int = 0
@@ -61,6 +66,7 @@ class Request:
             self.board,
             self.datum_cloud,
             self.datum_target,
+            self.colours,
         )
         return [path for path in named if path is not None]
 
@@ -113,13 +119,23 @@ def compare(request: Request, emit: Emit = silent) -> Comparison:
     target = read_target(request.target)
     emit(Event("stage", f"reading {request.cloud}"))
     cloud = read_cloud(request.cloud, request.seed)
-    scale = known_scale(request)
     emit(Event("stage", f"cleaning {len(cloud.points)} points"))
     cleaned = clean(cloud.points, request.seed)
+    scale = known_scale(request, cloud, cleaned)
     emit(Event("stage", "looking for the target's own symmetries"))
     symmetries = find_symmetries(target)
-    known = None if scale is None else scale.unit_mm
-    task = Task(cloud.points, cleaned, target, symmetries, known, read_datums(request), request.seed, emit)
+    task = Task(
+        cloud.points,
+        cleaned,
+        target,
+        symmetries,
+        None if scale is None else scale.unit_mm,
+        read_datums(request),
+        cloud.colours,
+        None if cloud.colours is None else _paint(request),
+        request.seed,
+        emit,
+    )
     registration = register(task)
     registration = _by_mode(request.mode, task, registration)
     made = Comparison(request, target, cloud, cleaned, registration, scale)
@@ -138,15 +154,32 @@ def _by_mode(mode: Mode, task: Task, found: Registration) -> Registration:
     return replace(found, best=replace(found.best, fit=fit))
 
 
-def known_scale(request: Request) -> Scale | None:
-    """Return the scale that is known beforehand, or None where geometry must find it."""
+def known_scale(request: Request, cloud: Cloud, cleaned: Cleaned) -> Scale | None:
+    """Return the scale that is known beforehand, or None where geometry must find it.
+
+    Without a file of markers the coded marks on the table are looked for in the cloud's own colours.
+    """
     if request.scale == "known":
         return Scale(request.unit_mm, 0.0, 0)
     if request.scale == "free":
         return None
-    if request.markers is None or request.board is None:
-        raise UsageError("--scale markers needs --markers (from the scan) and --board (as measured, mm)")
-    return scale_from_board(read_labelled(request.markers), read_labelled(request.board))
+    if request.board is None:
+        raise UsageError("--scale markers needs --board (as measured, mm), and --markers or a coloured cloud")
+    if request.markers is not None:
+        return scale_from_board(read_labelled(request.markers), read_labelled(request.board))
+    if cloud.colours is None:
+        raise UsageError("--scale markers without --markers needs a cloud with colours, to find the marks in it")
+    return scale_from_board(marks_on_table(cloud.points, cloud.colours, cleaned), read_labelled(request.board))
+
+
+def _paint(request: Request) -> Paint | None:
+    """Return what the specimen looks like: as the file asked for says, or the target's own colours, if it has any."""
+    if request.colours is not None:
+        return read_paint(request.colours)
+    if request.target.suffix.lower() != ".ply":
+        return None
+    points, colours = read_painted(request.target)
+    return None if colours is None else paint_of(points, colours)
 
 
 def read_datums(request: Request) -> Datums | None:
@@ -329,6 +362,11 @@ def _record_deviation(run: RunFolder, made: Comparison, found: Deviation) -> flo
     span, mesh, size = span_mm(found), made.target.mesh, made.target.diagonal_mm
     write_csv(run.artefact("deviation.csv"), found.points_mm, found.value_mm, found.area_weight, found.counts)
     write_ply(run.artefact("deviation.ply"), found.points_mm, found.value_mm, colours_of(found.value_mm, span))
+    if made.cloud.colours is not None:
+        chosen = np.flatnonzero(made.registration.specimen)[:: max(1, int(made.registration.specimen.sum()) // PAINTED)]
+        best = made.registration.best
+        assert best is not None
+        write_painted(run.artefact("colours.ply"), best.pose(made.cloud.points[chosen]), made.cloud.colours[chosen])
     np.savez_compressed(
         run.artefact("map.npz"), vertices_mm=mesh.vertices_mm, faces=mesh.faces, deviation_mm=found.vertex_mm
     )

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from fabctl.scan.foreign import nearest
 from fabctl.scan.rim import REACH_FIRST_FRAC, REACH_FRAC, Rest, Rim, rim_rows
-from fabctl.scan.similarity import Similarity, rotation_of
+from fabctl.scan.similarity import Similarity, jacobian, rotation_of
 from fabctl.scan.target import Target
 
 Floats = NDArray[np.float64]
@@ -120,13 +120,6 @@ def _patch_tree(target: Target) -> cKDTree:
 
 def _no_rows() -> Rows:
     return Rows(np.zeros((0, 7)), np.zeros(0), np.zeros(0), np.zeros(0))
-
-
-def jacobian(places: Floats, directions: Floats) -> Floats:
-    """Return how a residual along `directions` at `places` (about the centroid, in diagonals) changes with x."""
-    return np.concatenate(
-        [np.cross(places, directions), directions, np.sum(places * directions, axis=1)[:, None]], axis=1
-    )
 
 
 def patch_rows(points: Floats, pose: Similarity, target: Target, patches: cKDTree, band_frac: float) -> Rows:

@@ -10,20 +10,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from design.findings import Finding
 from fabctl.events import Emit, Event, silent
+from fabctl.scan.borders import circle
 from fabctl.scan.clean import Cleaned, Part
 from fabctl.scan.coarse import search, search_cloud
+from fabctl.scan.decide import HELD_FRAC, Datums, decide_by_border, decide_by_datums, decide_by_paint
 from fabctl.scan.judge import Judged, judge, thin
+from fabctl.scan.paint import Paint
 from fabctl.scan.refine import Options, moved_by, refine, weak_motions
 from fabctl.scan.rim import Rest
 from fabctl.scan.similarity import Similarity
-from fabctl.scan.symmetry import Symmetries, find_mirrors, spin_angle
+from fabctl.scan.symmetry import Symmetries, find_mirrors
 from fabctl.scan.target import Closest, Target
 
 Floats = NDArray[np.float64]
@@ -40,7 +45,6 @@ LEAST_MEMBERS = 200
 MIRROR_BETTER_RATIO = 0.7
 MIRROR_DOUBT_FRAC = 0.005
 SAME_POSE_FRAC = 0.004
-HELD_FRAC = 0.002  # of the diagonal; a motion that the surface does not hold to this is tried
 PUSHES_FRAC = (-0.04, -0.015, 0.015, 0.04)
 
 Status = Literal["aligned", "symmetric", "ambiguous", "failed", "mirrored"]
@@ -60,15 +64,6 @@ class Registration:
     decided_by: str = "geometry"
 
 
-@dataclass(frozen=True, slots=True)
-class Datums:
-    """Points known in both frames: labelled on the specimen, picked by a person, or markers."""
-
-    labels: tuple[str, ...]
-    cloud: Floats  # (k, 3), in the cloud's units
-    target_mm: Floats  # (k, 3)
-
-
 @dataclass(frozen=True)
 class Task:
     """What is to be registered, and what is known beforehand; `scale_ratio` is mm per cloud unit where it is known."""
@@ -79,6 +74,8 @@ class Task:
     symmetries: Symmetries
     scale_ratio: float | None = None
     datums: Datums | None = None
+    colours: NDArray[np.uint8] | None = None  # (n, 3), of the cloud
+    paint: Paint | None = None  # what the specimen looks like, in the target's frame
     seed: int = 0
     emit: Emit = field(default=silent)
 
@@ -100,6 +97,11 @@ class Body:
     part: Part
     even: Floats
     dense: Floats
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Return the dense points as read, to be asked for neighbours."""
+        return cKDTree(self.dense)
 
 
 def body_of(task: Task, part: Part) -> Body | None:
@@ -144,11 +146,13 @@ def _distinct(task: Task, judged: list[Judged]) -> list[Judged]:
 def pushed(task: Task, body: Body, best: Judged) -> list[Judged]:
     """Return where the best pose goes when it is pushed along the motions that the surface hardly holds."""
     weak = weak_motions(best.fit, task.target, task.options, HELD_FRAC)
-    return [
+    near = [
         tried(task, body, moved_by(best.pose, push * motion, task.target), "pushed along a weak motion")
         for motion in weak
         for push in PUSHES_FRAC
     ]
+    turned = [start for motion in weak[:1] for start in circle(body.tree, best.pose, motion, task.target).likeliest()]
+    return near + [tried(task, body, start, "turned until the border fits") for start in turned]
 
 
 def register(task: Task) -> Registration:
@@ -195,8 +199,25 @@ def _decided(task: Task, body: Body, found: list[Judged]) -> Registration:
             others = tuple(j for j in (best, *turned, *rivals) if j.fit.patches is not chosen.fit.patches)
             return _finished(task, "aligned", chosen, others, body, "datum points")
     turns = bool(turned) or task.symmetries.continuous
+    if task.paint is not None and task.colours is not None and (rivals or turns):
+        painted = _by_paint(task, body, [best, *turned, *rivals])
+        if painted is not None:
+            others = tuple(j for j in (best, *turned, *rivals) if j.fit.patches is not painted.fit.patches)
+            return _finished(task, "aligned", painted, others, body, "colour")
+    if rivals and not turns:
+        single_out = decide_by_border(body.tree, [best, *rivals], task.target, task.options)
+        if single_out is not None:
+            others = tuple(j for j in (best, *rivals) if j is not single_out)
+            return _finished(task, "aligned", single_out, others, body, "border")
     status: Status = "ambiguous" if rivals else "symmetric" if turns else "aligned"
     return _finished(task, status, best, (*turned, *rivals), body)
+
+
+def _by_paint(task: Task, body: Body, candidates: list[Judged]) -> Judged | None:
+    assert task.paint is not None and task.colours is not None
+    chosen = np.flatnonzero(_members(task.cleaned, body.part))
+    some = chosen[:: max(1, len(chosen) // DENSE_POINTS)]
+    return decide_by_paint(candidates, task.paint, task.points[some], task.colours[some], task.target, task.symmetries)
 
 
 def _mirrored(task: Task, body: Body, best: Judged) -> tuple[Judged | None, Judged | None]:
@@ -234,30 +255,6 @@ def _symmetric(task: Task, body: Body, best: Judged) -> Iterator[Judged]:
         found = tried(task, body, start, f"symmetry: {symmetry.describe()}")
         if found.score_frac <= RIVAL_RATIO * best.score_frac:
             yield found
-
-
-def decide_by_datums(
-    candidates: list[Judged], datums: Datums, target: Target, symmetries: Symmetries
-) -> tuple[Judged, bool]:
-    """Return the candidate that the datum points single out, and whether they do.
-
-    They do where the best candidate's points miss by less than a third of what the next one's do. About the axis of a
-    surface of revolution the points also choose the turn.
-    """
-    placed = [spun_to(j, datums, symmetries) for j in candidates]
-    miss = [float(np.sqrt(((j.pose(datums.cloud) - datums.target_mm) ** 2).sum(axis=1).mean())) for j in placed]
-    order = np.argsort(miss)
-    single = len(order) == 1 or miss[order[0]] < miss[order[1]] / 3
-    fits = miss[order[0]] < 0.05 * target.diagonal_mm
-    return placed[order[0]], bool(single and fits)
-
-
-def spun_to(judged: Judged, datums: Datums, symmetries: Symmetries) -> Judged:
-    """Return the pose turned about the axis of revolution so that the datum points fit best."""
-    if symmetries.axis_point_mm is None or symmetries.axis_direction is None:
-        return judged
-    angle = spin_angle(judged.pose(datums.cloud), datums.target_mm, symmetries.axis_point_mm, symmetries.axis_direction)
-    return replace(judged, fit=replace(judged.fit, pose=symmetries.spin(angle).after(judged.pose)))
 
 
 def _finished(

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from fabctl.scan.clean import Plane
 from fabctl.scan.foreign import nearest
 from fabctl.scan.nearest import farthest_order
-from fabctl.scan.similarity import Similarity
+from fabctl.scan.similarity import Similarity, jacobian
 from fabctl.scan.target import Target
 
 Floats = NDArray[np.float64]
@@ -58,8 +58,6 @@ def rim_rows(
     The edge is a high quantile of how far out the points near a stretch lie; where the cloud ends well inside there
     is none, so holes elsewhere do not matter.
     """
-    from fabctl.scan.refine import jacobian
-
     border, size = target.border, target.diagonal_mm
     if border is None:
         return None

@@ -54,6 +54,13 @@ def rotation_of(turn_rad: Floats) -> Floats:
     return np.asarray(np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross)
 
 
+def jacobian(places: Floats, directions: Floats) -> Floats:
+    """Return how a residual along `directions` at `places` (about the centroid, in diagonals) changes with x."""
+    return np.concatenate(
+        [np.cross(places, directions), directions, np.sum(places * directions, axis=1)[:, None]], axis=1
+    )
+
+
 def axis_and_angle(rotation: Floats) -> tuple[Floats, float]:
     """Return the unit axis and the angle in radians (0 to pi) of a proper rotation."""
     angle = math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fabctl.scan.coarse import distinct, search, search_cloud
 from fabctl.scan.nearest import poses
-from fabctl.scan.similarity import IDENTITY, Similarity, axis_and_angle, rotation_of
+from fabctl.scan.similarity import IDENTITY, Similarity, axis_and_angle, jacobian, rotation_of
 from fabctl.scan.target import Target
 
 Floats = NDArray[np.float64]
@@ -165,8 +165,6 @@ def _self_fits(target: Target, *, mirror: bool) -> list[Symmetry]:
 
 def _polished(motion: Similarity, target: Target, probes: Floats) -> Similarity:
     """Return the motion after exact point-to-plane steps in both directions."""
-    from fabctl.scan.refine import jacobian
-
     size, centre = target.diagonal_mm, target.centre_mm
     for _ in range(POLISH_STEPS):
         rows, rest = [], []
@@ -204,8 +202,30 @@ def _axis_of_revolution(target: Target, turns: list[Symmetry]) -> tuple[Floats, 
         trial = Symmetries((), target.centre_mm, direction)
         worst = max(_misfit_frac(trial.spin(angle), target, probes) for angle in AXIS_TEST_RAD)
         if worst < NEAR_FRAC:
-            return target.centre_mm, direction, worst
+            return _best_axis(trial, worst, target, probes)
     return None
+
+
+def _best_axis(found: Symmetries, worst: float, target: Target, probes: Floats) -> tuple[Floats, Floats, float]:
+    """Return point, direction and misfit of the axis that turns fitted in their own right agree on.
+
+    A surface that is round to a tenth of a percent only has its centroid and main directions a little beside its axis.
+    """
+    assert found.axis_direction is not None
+    motions = [_polished(found.spin(angle), target, probes) for angle in AXIS_TEST_RAD]
+    axes = [axis_and_angle(m.rotation)[0] for m in motions]
+    direction = np.sum([a * np.sign(a @ found.axis_direction) for a in axes], axis=0)
+    direction /= np.linalg.norm(direction)
+    # The points that no motion moves: (1 - R) p = shift; along the axis p stays that of the centroid.
+    still = np.concatenate([np.eye(3) - m.rotation for m in motions] + [direction[None]])
+    shifts = np.concatenate([m.shift for m in motions] + [[float(direction @ target.centre_mm)]])
+    point = np.linalg.lstsq(still, shifts, rcond=None)[0]
+    better = Symmetries((), point, direction)
+    misfit = max(_misfit_frac(better.spin(angle), target, probes) for angle in AXIS_TEST_RAD)
+    if misfit >= worst:
+        assert found.axis_point_mm is not None
+        return found.axis_point_mm, found.axis_direction, worst
+    return np.asarray(point), np.asarray(direction), misfit
 
 
 def _candidate_axes(target: Target, turns: list[Symmetry]) -> list[Floats]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fabctl.errors import RefusedError, UsageError
+from fabctl.scan import stream
 from fabctl.scan.cloud import read_cloud, read_labelled
 from fabctl.scan.foreign import open3d
 
@@ -73,10 +74,53 @@ def test_points_that_are_no_numbers_are_left_out_and_counted(tmp_path: Path) -> 
     assert "7 points" in found.findings[0].message
 
 
-def test_more_points_than_asked_for_are_thinned_and_it_says_so(tmp_path: Path) -> None:
-    found = read_cloud(written(tmp_path, "xyz"), seed=1, most=600)
+@pytest.mark.parametrize("kind", ["ply", "xyz", "csv", "las"])
+def test_more_points_than_asked_for_are_thinned_and_it_says_so(tmp_path: Path, kind: str) -> None:
+    path = written(tmp_path, kind)
+    found, again = read_cloud(path, seed=1, most=600), read_cloud(path, seed=1, most=600)
     assert len(found.points) == 600
     assert found.findings[0].code == "SCAN-THINNED"
+    assert "900 points were thinned to 600" in found.findings[0].message
+    assert np.array_equal(found.points, again.points)
+    assert not np.array_equal(found.points, read_cloud(path, seed=2, most=600).points)
+
+
+def test_a_file_read_in_small_pieces_is_drawn_evenly(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    table = np.zeros(
+        20_000, dtype=[("x", ">f4"), ("y", ">f4"), ("z", ">f4"), ("red", ">f4"), ("green", ">f4"), ("blue", ">f4")]
+    )
+    table["x"], table["y"], table["blue"] = np.arange(20_000), 1.0, 0.5
+    lines = ["ply", "format binary_big_endian 1.0", "element vertex 20000"]
+    lines += [f"property float {name}" for name in table.dtype.names or ()]
+    (tmp_path / "big.ply").write_bytes("\n".join([*lines, "end_header\n"]).encode() + table.tobytes())
+    monkeypatch.setattr(stream, "PIECE", 700)
+    found = read_cloud(tmp_path / "big.ply", most=2000)
+    assert len(np.unique(found.points[:, 0])) == 2000
+    assert np.histogram(found.points[:, 0], bins=4)[0] == pytest.approx(500, abs=90)
+    assert found.colours is not None
+    assert (found.colours == [0, 0, 128]).all()
+
+
+def test_a_ply_that_ends_too_early_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, "ply")
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(RefusedError, match="ends after"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("gain", [1, 255])
+def test_colours_and_normals_of_a_text_file_are_known_by_their_range(tmp_path: Path, gain: int) -> None:
+    normals = POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)
+    colours = np.random.default_rng(1).integers(0, 256, POINTS.shape) / 255 * gain
+    table = np.concatenate([POINTS, normals, colours], axis=1)
+    (tmp_path / "cloud.xyz").write_text(
+        "x y z nx ny nz r g b\n" + "\n".join(" ".join(f"{v:.6f}" for v in row) for row in table)
+    )
+    found = read_cloud(tmp_path / "cloud.xyz")
+    assert found.normals is not None
+    assert found.colours is not None
+    assert np.allclose(found.normals, normals, atol=1e-4)
+    assert np.allclose(found.colours, np.round(colours / gain * 255), atol=1)
 
 
 def test_every_bad_line_of_a_label_file_is_named(tmp_path: Path) -> None:

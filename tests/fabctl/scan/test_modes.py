@@ -7,10 +7,11 @@ import pytest
 
 from fabctl.errors import RefusedError, UsageError
 from fabctl.scan.clean import Cells, Cleaned, Plane
+from fabctl.scan.decide import Datums
 from fabctl.scan.markers import scale_from_board
 from fabctl.scan.modes import aligned_by, tilt_rad, upright
 from fabctl.scan.refine import Options, refine
-from fabctl.scan.register import Datums, Task
+from fabctl.scan.register import Task
 from fabctl.scan.repeat import repeatability
 from fabctl.scan.similarity import IDENTITY, Similarity, rotation_of
 from fabctl.scan.symmetry import Symmetries

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fabctl.scan.clean import clean
-from fabctl.scan.register import Datums, Registration, Task, register
+from fabctl.scan.decide import Datums
+from fabctl.scan.register import Registration, Task, register
 from simulators.photogrammetry import ScanPlan
 from tests.fabctl.scan.conftest import TARGETS, scanned, symmetries_of, true_pose
 
