@@ -51,6 +51,7 @@ class Laser:
         self.link = Link(transport, self.clock)
         self.identity: Identity | None = None
         self.left: Leaving | None = None
+        self.hurried = False  # the operator has asked twice: `off` waits for no standstill
         self._quiet = False  # the board is idle, dark and empty: closing the line is enough
 
     def __enter__(self) -> Laser:
@@ -262,7 +263,7 @@ class Laser:
     def _hold_hard(self) -> bool:
         """Ask for a hold until the board stands or time is up; return whether it stands."""
         end_s = self.clock.now_s() + HOLD_S
-        while self.clock.now_s() < end_s:
+        while self.clock.now_s() < end_s and not self.hurried:
             self.link.send(HOLD + STATUS)
             came, _ = self.link.wait_for(lambda m: isinstance(m, Report), STEP_WAIT_S)
             report = self.link.report

@@ -5,11 +5,14 @@ Everything is asked before the first motion. On every way out the beam is off an
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from design.findings import Finding, errors
@@ -227,6 +230,33 @@ def design_files(design: Path) -> list[Path]:
 
 
 @contextmanager
+def one_interrupt(laser: Laser) -> Iterator[None]:
+    """Let the first Ctrl-C or SIGTERM interrupt, and further ones only make `off` reset at once.
+
+    An exception in the middle of making the machine safe, or of writing down how it was left, would undo both.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard = False
+
+    def hear(_number: int, _frame: FrameType | None) -> None:
+        nonlocal heard
+        if heard:
+            laser.hurried = True
+            return
+        heard = True
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, hear) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
 def recorded(run: RunFolder, laser: Laser, log: WireLog, desk: Desk, plan: CutPlan) -> Iterator[Emit]:
     """Keep the record of a run: job and wire while it runs, the outcome on every way out."""
     write_atomically(run.artefact("job.nc"), plan.text)
@@ -239,11 +269,15 @@ def recorded(run: RunFolder, laser: Laser, log: WireLog, desk: Desk, plan: CutPl
         write_event(event)
         desk.emit(event)
 
+    with one_interrupt(laser):
+        yield from _recorded(run, laser, tell)
+
+
+def _recorded(run: RunFolder, laser: Laser, tell: Emit) -> Iterator[Emit]:
     try:
         yield tell
     except (KeyboardInterrupt, StoppedByOperator) as fault:
-        left = _left(laser)
-        run.finish("stopped", "stopped by the operator", **left)
+        run.finish("stopped", "stopped by the operator", **_left(laser))
         raise Stopped(f"stopped; {run.run_id} says how far it came; fabctl cut run … --resume {run.run_id}") from fault
     except FabctlError as fault:
         run.finish("refused" if isinstance(fault, RefusedError) else "failed", str(fault), **_left(laser))
