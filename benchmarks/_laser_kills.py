@@ -17,7 +17,7 @@ from fabctl.cut.place import Affine
 from fabctl.cut.plan import CutPlan, program_times
 from fabctl.cut.program import Program, read_program
 from fabctl.cut.progress import Track
-from fabctl.cut.trail import MARK, PROGRAM_BEGINS, read_trail, rest_of, stopped_at, stroke_start
+from fabctl.cut.trail import MARK, PROGRAM_BEGINS, last_seen, read_trail, rest_of, stopped_at
 from fabctl.events import silent
 from simulators.grbl.board import Point
 
@@ -96,7 +96,7 @@ def resumed(rig: Rig, rows: list[str], program: Program, died_s: float, restart:
     place = stopped_at(trail, program, times, laser.report(), (0.0, 0.0, 0.0), rig.clock.now_s() - died_s)
     if place is None:
         laser.home()
-    follow(laser, read_program(rest_of(program, place or stroke_start(trail, program))), again)
+    follow(laser, read_program(rest_of(program, place or last_seen(trail, program))), again)
     return place is not None
 
 

@@ -13,6 +13,7 @@ from drivers.grbl.run import Progress, Wish
 from drivers.transport.memory import MemoryTransport
 from simulators.faults import Fault
 from simulators.grbl.board import Board, Point
+from simulators.grbl.dialects import GRBL, Dialect
 from simulators.grbl.machine import Machine, State, World
 from simulators.grbl.settings import Memory
 
@@ -44,6 +45,7 @@ class Rig:
     settings: dict[int, float] = field(default_factory=lambda: dict(LAB))
     homed: bool = True
     options: str = "V"
+    dialect: Dialect = GRBL
     trace: list[Point] = field(default_factory=list)
     sent: bytearray = field(default_factory=bytearray)
     unplugged: bool = False
@@ -55,7 +57,12 @@ class Rig:
         for number, value in self.settings.items():
             assert memory.store(number, value) == 0
         memory.pending_s = 0.0
-        machine = Machine(memory=memory, world=World(switches=True, real_mm=(-40.0, -30.0, -5.0)), options=self.options)
+        machine = Machine(
+            memory=memory,
+            world=World(switches=True, real_mm=(-40.0, -30.0, -5.0)),
+            options=self.options,
+            dialect=self.dialect,
+        )
         self.board = Board(machine, trace=self.trace.append)
         if self.homed:
             machine.state = State.IDLE

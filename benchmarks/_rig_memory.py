@@ -48,6 +48,9 @@ class MemoryBus:
         assert words is not None
         return words
 
+    def drain(self) -> None:
+        """Do nothing: no reply is ever under way."""
+
     def close(self) -> None:
         """Do nothing."""
 

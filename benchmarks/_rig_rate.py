@@ -16,6 +16,7 @@ from fabctl.config.rig import load_rig
 from fabctl.indent.method import Action
 from fabctl.indent.recorder import Recorder
 from fabctl.indent.run import Runner
+from fabctl.priority import before_other_work
 
 ROOT = Path(__file__).resolve().parents[1]
 WINDOW_S = 0.005
@@ -34,11 +35,13 @@ def slots_met_frac(folder: Path, serial: bool, rate_hz: float, duration_s: float
             limits=LimitsConfig(force_N=5.0, travel_mm=50.0),
             steps=(Hold(step="hold", time_s=duration_s),),
         )
-        recorder = Recorder(folder / "samples.csv")
-        with contextlib.closing(open_indenter(url, load_rig("reference", ROOT))) as rig:
-            plan = (Action("hold", time_s=duration_s),)
+        plan = (Action("hold", time_s=duration_s),)
+        with (
+            contextlib.closing(open_indenter(url, load_rig("reference", ROOT))) as rig,
+            before_other_work(),
+            contextlib.closing(Recorder(folder / "samples.csv")) as recorder,
+        ):
             Runner(rig, method, plan, recorder, WallClock(), rate_hz).execute()
-        recorder.close()
     finally:
         process.terminate()
         process.wait(timeout=10)

@@ -245,7 +245,8 @@ def kills(count: int) -> list[Figure]:
         lit_s = max(lit_s, lit_while_standing(rig.trace))
         missing += missing_count(rig, program)
         worst_mm = max(worst_mm, twice_mm(rig, program))
-        rig, rows, died_s = killed_run(seed, program, absence_s=0.0)
+        # at once, in the middle of what it holds, or after all of it: a plug pulled, and the power some time later
+        rig, rows, died_s = killed_run(seed, program, absence_s=(0.0, 0.4, 8.0)[seed % 3])
         believed += resumed(rig, rows, program, died_s, restart=True)
         lost_missing += missing_count(rig, program)
         lost_mm = max(lost_mm, twice_mm(rig, program))

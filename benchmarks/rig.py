@@ -160,10 +160,14 @@ def rate(quick: bool) -> list[Figure]:
     found = []
     for serial, hz, name in ((False, 100.0, "100 Hz over TCP"), (True, 50.0, "50 Hz over RTU at 115200")):
         with tempfile.TemporaryDirectory() as folder:
-            share, jitter_ms = slots_met_frac(Path(folder), serial, hz, 5.0 if quick else 30.0)
+            share, jitter_ms = slots_met_frac(Path(folder), serial, hz, 5.0 if quick else 60.0)
         target = ">= 99 % of the slots within +-5 ms"
-        found.append(Figure(f"slots met, {name}", round(100 * share, 2), "%", target, share >= 0.99, int(hz * 30)))
-        found.append(Figure(f"jitter p99, {name}", round(jitter_ms, 2), "ms", "", None, int(hz * 30)))
+        found.append(
+            Figure(
+                f"slots met, {name}", round(100 * share, 2), "%", target, share >= 0.99, int(hz * (5 if quick else 60))
+            )
+        )
+        found.append(Figure(f"jitter p99, {name}", round(jitter_ms, 2), "ms", "", None, int(hz * (5 if quick else 60))))
     return found
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +17,10 @@ from design.cells.homogenise import Cell, Failure, Pair
 from design.cells.library import CellLibrary, energy_scale_mJ
 from design.cells.mesh import REFERENCE, Density
 from design.cells.sheet import Sheet
+from design.errors import DesignError
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 COMPARABLE_STRIP_RATIO = 0.01  # t_s/edge: below, the published map is resampled over its own border
 COMPARABLE_BARRIER = 0.3  # in the published unit
@@ -74,17 +78,69 @@ class Comparison:
     worst: tuple[int, ...]  # rows of the table, worst expansion first
 
 
+COLUMNS = ("t_over_l0", "theta_rad", "expansion_ratio", "energy_barrier", "stiffness")
+PLACE_COLUMNS = COLUMNS[:2]  # without them a row is no cell; a missing figure is only not compared
+TOLD_FAULTS_COUNT = 20
+
+
+class TableError(DesignError):
+    """The table cannot be read; `faults` says all that is wrong with it."""
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        told = "; ".join(faults[:TOLD_FAULTS_COUNT])
+        more = len(faults) - TOLD_FAULTS_COUNT
+        super().__init__(f"{told}; and {more} more" if more > 0 else told)
+        self.faults = tuple(faults)
+
+
 def read_published(text: str, sheet: Sheet) -> Published:
-    """Return the table in `text`: t_over_l0, theta_rad, expansion_ratio, energy_barrier, stiffness, under a header."""
-    lines = [line for line in text.splitlines() if line.strip()]
-    names = [name.strip() for name in lines[0].split(",")]
-    wanted = ["t_over_l0", "theta_rad", "expansion_ratio", "energy_barrier", "stiffness"]
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        raise ValueError(f"no column {', '.join(missing)}; the header must name {', '.join(wanted)}")
-    rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
-    t, theta, expansion, barrier, stiffness = (rows[:, names.index(name)] for name in wanted)
+    """Return the table in `text`, whose header names `COLUMNS` in any order and case, among others.
+
+    An empty or `nan` figure is kept as NaN and not compared. Raises `TableError` with every fault at once.
+    """
+    lines = [(k, line) for k, line in enumerate(text.lstrip("\ufeff").splitlines(), 1) if _is_content(line)]
+    if not lines:
+        raise TableError([f"the table is empty; its header must name {', '.join(COLUMNS)}"])
+    names = [name.strip().lower() for name in _cells(lines[0][1])]
+    faults = [f"no column {name} in the header" for name in COLUMNS if name not in names]
+    faults += [f"the header names {name} more than once" for name in COLUMNS if names.count(name) > 1]
+    if faults:
+        raise TableError(faults)
+    if len(lines) == 1:
+        raise TableError(["the table has a header and no rows"])
+    places = [names.index(name) for name in COLUMNS]
+    rows = []
+    for number, line in lines[1:]:
+        cells = _cells(line)
+        if len(cells) != len(names):
+            faults.append(f"line {number}: {len(cells)} cells under {len(names)} names")
+            continue
+        pairs = zip(COLUMNS, places, strict=True)
+        rows.append([_number(cells[k], name, number, faults) for name, k in pairs])
+    if faults:
+        raise TableError(faults)
+    t, theta, expansion, barrier, stiffness = np.array(rows).T
     return Published(t * sheet.edge_mm, theta, expansion, barrier, stiffness)
+
+
+def _is_content(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
+def _cells(line: str) -> list[str]:
+    return next(csv.reader([line]))
+
+
+def _number(cell: str, name: str, line: int, faults: list[str]) -> float:
+    """Return the cell as a number, NaN where it is empty; what cannot be used is added to `faults`."""
+    try:
+        value = float(cell) if cell.strip() else math.nan
+    except ValueError:
+        faults.append(f"line {line}: {name} {cell.strip()!r} is no number")
+        return math.nan
+    if name in PLACE_COLUMNS and not math.isfinite(value):
+        faults.append(f"line {line}: {name} is {cell.strip() or 'empty'}")
+    return value if math.isfinite(value) else math.nan
 
 
 def solve_rows(
@@ -97,13 +153,13 @@ def solve_rows(
     """Return each row of the table solved; rows of one θ follow each other, so each starts from its neighbours."""
     columns = [np.flatnonzero(table.theta_rad == theta) for theta in np.unique(table.theta_rad)]
     columns = [rows[np.argsort(table.t_mm[rows], kind="stable")] for rows in columns]
-    works = [(table.t_mm[rows], float(table.theta_rad[rows[0]]), sheet, density) for rows in columns]
+    columns.sort(key=len, reverse=True)  # so that no worker is left alone with a long column at the end
     found: list[Cell | None] = [None] * len(table.t_mm)
     from joblib import Parallel, delayed
 
     finished = 0
-    solved = Parallel(n_jobs=jobs, return_as="generator")(delayed(_column)(*work) for work in works)
-    for rows, cells in zip(columns, solved, strict=True):
+    work = (delayed(_solve_rows)(rows, table, sheet, density) for rows in columns)
+    for rows, cells in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
         for row, cell in zip(rows, cells, strict=True):
             found[row] = cell
         finished += len(rows)
@@ -112,12 +168,16 @@ def solve_rows(
     return [cell for cell in found if cell is not None]
 
 
+def _solve_rows(rows: Ints, table: Published, sheet: Sheet, density: Density) -> tuple[Ints, list[Cell]]:
+    return rows, _column(table.t_mm[rows], float(table.theta_rad[rows[0]]), sheet, density)
+
+
 def _column(t_mm: Array, theta_rad: float, sheet: Sheet, density: Density) -> list[Cell]:
     cells = []
     before: list[Pair] = []
     steps = np.diff(t_mm, prepend=np.nan)
     for k, t in enumerate(t_mm):
-        even = len(before) == 2 and abs(steps[k] / steps[k - 1] - 1) < 0.2
+        even = len(before) == 2 and 0.8 * steps[k - 1] < steps[k] < 1.2 * steps[k - 1]
         found = homogenise.solve_pair(
             float(t), theta_rad, sheet, density, homogenise.predicted(*before) if even else None
         )
@@ -151,7 +211,7 @@ def compared(
     """Return the errors over `subset`; the one scale is fitted to the stiffness there unless given."""
     expansion, stiffness, barrier = (values[subset] for values in numbers)
     if scale is None:
-        scale = float(np.nanmedian(table.stiffness_ratio[subset] / stiffness))
+        scale = _median(table.stiffness_ratio[subset] / stiffness)
     error = expansion - table.expansion_ratio[subset]
     order = np.argsort(-np.where(np.isfinite(error), np.abs(error), -1.0))[:5]
     return Comparison(
@@ -159,11 +219,46 @@ def compared(
         answered_count=int(np.isfinite(expansion).sum()),
         scale=scale,
         expansion=Spread.of(error),
-        expansion_bias_ratio=float(np.nanmedian(error)),
+        expansion_bias_ratio=_median(error),
         stiffness=Spread.of(scale * stiffness / table.stiffness_ratio[subset] - 1),
         barrier=Spread.of(scale * barrier / table.barrier_ratio[subset] - 1),
         worst=tuple(int(row) for row in np.flatnonzero(subset)[order]),
     )
+
+
+def _median(values: Array) -> float:
+    """Return the median of the finite `values`, NaN where there is none."""
+    good = values[np.isfinite(values)]
+    return float(np.median(good)) if len(good) else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Unanswered:
+    """A row of the table for which a way has no numbers."""
+
+    row: int  # counted from 1, the header left out
+    t_mm: float
+    theta_deg: float
+    verdict: str
+    reason: str
+
+
+def unanswered(cells: list[Cell]) -> list[Unanswered]:
+    """Return every row that was solved to no bistable cell, with the reason."""
+    return [
+        Unanswered(k, cell.t_mm, math.degrees(cell.theta_rad), cell.verdict, cell.reason)
+        for k, cell in enumerate(cells, 1)
+        if cell.verdict != "bistable"
+    ]
+
+
+def outside(table: Published, expansion_ratio: Array) -> list[Unanswered]:
+    """Return every row that the map could not be read at."""
+    reason = "no bistable cells of the map surround it"
+    return [
+        Unanswered(k + 1, float(table.t_mm[k]), math.degrees(table.theta_rad[k]), "outside the map", reason)
+        for k in np.flatnonzero(~np.isfinite(expansion_ratio)).tolist()
+    ]
 
 
 def verdicts(cells: list[Cell]) -> dict[str, int]:

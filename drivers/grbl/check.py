@@ -35,7 +35,7 @@ def check_program(link: Link, lines: Sequence[str], rx_bytes: int) -> list[tuple
             elif isinstance(message, Error):
                 refused.append((stream.answered(), message.code))
             elif isinstance(message, Alarm):
-                raise alarm(message.code)
+                raise alarm(message.code, link.firmware)
             elif isinstance(message, Banner):
                 raise BoardRestarted(message.text)
     _leave(link)

@@ -11,8 +11,8 @@ WHO = "the laser"
 class LineRefused(DeviceRefused):
     """The board refused a line of a program with `error:n`; the lines already in its buffer still run."""
 
-    def __init__(self, index: int, line: str, code: int, sent_count: int) -> None:
-        meaning, hint = error_meaning(code)
+    def __init__(self, index: int, line: str, code: int, sent_count: int, firmware: str = "grbl") -> None:
+        meaning, hint = error_meaning(code, firmware)
         super().__init__(WHO, line, f"error {code}: {meaning}", hint)
         self.index, self.line, self.code, self.sent_count = index, line, code, sent_count
 

@@ -83,6 +83,7 @@ class Laser:
             )
         self.link.wait_for(lambda _: False, SETTLE_S)
         self.identity = self._identify(banner)
+        self.link.firmware = self.identity.firmware
         self._quiet = True
         return self.identity
 
@@ -220,7 +221,7 @@ class Laser:
             _, seen = self.link.wait_for(lambda m: isinstance(m, Report), 0.5)
             for message in seen:
                 if isinstance(message, Alarm):
-                    raise alarm(message.code)
+                    raise alarm(message.code, self.link.firmware)
                 if isinstance(message, Banner):
                     raise BoardRestarted(message.text)
             if self.link.report is not None and self.link.report.state == "Idle":

@@ -18,9 +18,9 @@ ANSWER_S = 3.0
 DRAINS_COUNT = 32
 
 
-def alarm(code: int) -> DeviceAlarm:
-    """Return the error for `ALARM:code`."""
-    return DeviceAlarm(WHO, code, *alarm_meaning(code))
+def alarm(code: int, firmware: str = "grbl") -> DeviceAlarm:
+    """Return the error for `ALARM:code` of this firmware."""
+    return DeviceAlarm(WHO, code, *alarm_meaning(code, firmware))
 
 
 class Link:
@@ -32,6 +32,7 @@ class Link:
         self.report: Report | None = None
         self.reported_s = 0.0
         self.garbled: list[str] = []
+        self.firmware = "grbl"  # whose numbers `error:` and `ALARM:` are; known once identified
 
     def send(self, data: bytes) -> None:
         """Put bytes on the line."""
@@ -85,10 +86,10 @@ class Link:
             if isinstance(message, Ok):
                 return seen[: seen.index(message)]
             if isinstance(message, Error):
-                meaning, hint = error_meaning(message.code)
+                meaning, hint = error_meaning(message.code, self.firmware)
                 raise DeviceRefused(WHO, line, f"error {message.code}: {meaning}", hint)
             if isinstance(message, Alarm):
-                raise alarm(message.code)
+                raise alarm(message.code, self.firmware)
             if isinstance(message, Banner):
                 raise BoardRestarted(message.text)
         raise DeviceTimeout(WHO, repr(line), timeout_s, "is this a GRBL board, at the right speed?")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from drivers.grbl import dialects
+
 ERRORS: dict[int, tuple[str, str]] = {
     1: ("a word does not begin with a letter", "look for a stray character in the line"),
     2: ("a letter has no number after it, or the number cannot be read", "complete the word"),
@@ -50,21 +52,15 @@ ALARMS: dict[int, tuple[str, str]] = {
     7: ("the door was opened during homing", "close it and home again"),
     8: ("the limit switch stayed pressed after pulling off", "raise $27, check the switch"),
     9: ("no limit switch was found while homing", "check the switches, $23 and the travel $130…"),
-    10: ("the second motor of an axis found no switch", "check the switches of the doubled axis"),
-    11: ("homing is required", "home the machine"),
-    12: ("a limit switch is pressed", "move off the switch"),
-    13: ("emergency stop is pressed", "release it, then reset and home"),
-    14: ("homing is required before motion", "home the machine"),
-    17: ("a motor driver reports a fault", "switch off and look at the drivers"),
 }
 UNKNOWN = ("a number this program does not know", "look it up in the firmware's own list")
 
 
-def error_meaning(code: int) -> tuple[str, str]:
-    """Return what `error:code` means and what to do."""
-    return ERRORS.get(code, UNKNOWN)
+def error_meaning(code: int, firmware: str = "grbl") -> tuple[str, str]:
+    """Return what `error:code` of this firmware means and what to do."""
+    return dialects.ERRORS.get(firmware, {}).get(code) or ERRORS.get(code, UNKNOWN)
 
 
-def alarm_meaning(code: int) -> tuple[str, str]:
-    """Return what `ALARM:code` means and what to do."""
-    return ALARMS.get(code, UNKNOWN)
+def alarm_meaning(code: int, firmware: str = "grbl") -> tuple[str, str]:
+    """Return what `ALARM:code` of this firmware means and what to do."""
+    return dialects.ALARMS.get(firmware, {}).get(code) or ALARMS.get(code, UNKNOWN)

@@ -19,7 +19,7 @@ from drivers.grbl.link import HOLD, START, STATUS, Link, alarm
 from drivers.grbl.messages import Alarm, Banner, Error, Garbled, Message, Ok, Report
 from drivers.grbl.stream import Stream
 
-POLL_S = 0.1
+POLL_S = 0.05  # how old the place may be by which lines are held back
 ASK_AGAIN_S = 0.3
 STALL_S = 0.8
 IDLE_PROOF_S = 0.25  # Idle seen twice so far apart, with lines unanswered: an answer is lost
@@ -124,9 +124,9 @@ class _Run:
             self.idle_since_s = None
         elif isinstance(message, Error):
             index = self.stream.answered()
-            raise LineRefused(index, self.stream.lines[index], message.code, self.stream.sent_count)
+            raise LineRefused(index, self.stream.lines[index], message.code, self.stream.sent_count, self.link.firmware)
         elif isinstance(message, Alarm):
-            raise alarm(message.code)
+            raise alarm(message.code, self.link.firmware)
         elif isinstance(message, Banner):
             raise BoardRestarted(message.text)
         elif isinstance(message, Report):
@@ -140,7 +140,7 @@ class _Run:
         now_s = self.link.clock.now_s()
         self.unanswered_s = None
         if report.state in ("Alarm", "Sleep", "Check"):
-            raise alarm(0)
+            raise alarm(0, self.link.firmware)
         free = report.free_bytes
         if free is not None and self.empty_bytes is not None:
             used = self.empty_bytes - free

@@ -53,6 +53,10 @@ class RegisterBus(Protocol):
         """Write holding registers and then read some, in one request."""
         ...
 
+    def drain(self) -> None:
+        """Throw away what comes for as long as the device may take to answer."""
+        ...
+
     def close(self) -> None:
         """Let go of the line."""
         ...
@@ -90,7 +94,7 @@ class ModbusBus:
         what = f"write of registers {address} to {address + len(values) - 1}"
         reply = self._ask(what, 16, lambda: self._client.write_registers(address, list(values), device_id=self._unit))
         if (reply.address, reply.count) != (address, len(values)):
-            self._drain()
+            self.drain()
             raise BadReply(f"{self.url}: {what}: the reply speaks of {reply.count} registers at {reply.address}")
 
     def exchange(self, read_address: int, count: int, write_address: int, values: Sequence[int]) -> list[int]:
@@ -125,23 +129,23 @@ class ModbusBus:
             raise TransportError(self.url, f"{what}: the line broke", "check cable and power") from fault
         except (ModbusException, struct.error, IndexError, ValueError) as fault:
             # What cannot be parsed is as good as no reply, and the rest of it may still be on its way.
-            self._drain()
+            self.drain()
             raise DeviceTimeout(self.url, what, self._timeout_s, "check unit id, baud rate and cable") from fault
         if reply.isError():
             raise ExceptionReply(self.url, what, int(reply.exception_code))
         if reply.function_code != function:
-            self._drain()
+            self.drain()
             raise BadReply(f"{self.url}: {what}: a reply of function {reply.function_code} came, not {function}")
         return reply
 
     def _registers(self, what: str, reply: Any, count: int) -> list[int]:
         registers = [int(word) for word in reply.registers]
         if len(registers) != count:
-            self._drain()
+            self.drain()
             raise BadReply(f"{self.url}: {what}: {len(registers)} registers came, {count} were asked for")
         return registers
 
-    def _drain(self) -> None:
+    def drain(self) -> None:
         """Throw away what comes for as long as the device may take to answer."""
         until_s = time.monotonic() + self._response_max_s
         try:

@@ -16,7 +16,7 @@ from typing import Literal, TypeVar
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout, ProtocolError, TransportError
 from drivers.rig.bus import ExceptionReply, RegisterBus, open_bus
 from drivers.rig.registers import BadReply, RegisterMap, Value
-from drivers.rig.samples import Asked, Freshness, Restarted, Sample
+from drivers.rig.samples import Asked, Freshness, Restarted, Sample, Stale
 
 LOST = (DeviceTimeout, BadReply, ExceptionReply)  # one reply less; the next request may do better
 Guard = Literal["none", "above", "below"]
@@ -145,8 +145,10 @@ class Indenter:
                 self.bus.write(feed.address, fed)
                 words = self.bus.read(status.table, status.address, status.words_count)
             found = self._fresh.believe(words, Asked(self._request, sent_s, self._now_s()))
-        except LOST:
+        except LOST as fault:
             self.lost_count += 1
+            if isinstance(fault, Stale):
+                self.bus.drain()  # another reply is still on its way, and would answer the next request
             raise
         self._number = max(self._number, found.command_id)
         self.hear(found)
@@ -179,6 +181,7 @@ class Indenter:
             "acceleration": limits.acceleration_mm_s2,
             "watchdog": limits.watchdog_s,
         }
+        self._refuse_outside("settings", "limits", values)
         words = self.registers.encode("settings", values)
         block = self.registers.blocks["settings"]
         self._again(lambda: self.bus.write(block.address, words))
@@ -251,6 +254,7 @@ class Indenter:
 
     def _confirmed(self, command: str, once: bool = True, **values: float) -> int:
         """Send a command once and return its number when the status shows it; see the head of this file."""
+        self._refuse_outside("command", command, values)
         if self._number == 0:
             self.fresh_sample()  # the numbers go on from the controller's last one
         for attempt in range(1 if once else 5):
@@ -269,6 +273,11 @@ class Indenter:
                 raise MotionUnknown(command, number, stopped)
             self._sleep(self.registers.response_max_s * attempt)
         raise DeviceTimeout(self.bus.url, f"confirmation of {command}", self.registers.timeout_s * 5)
+
+    def _refuse_outside(self, block: str, command: str, values: Mapping[str, Value]) -> None:
+        """Raise before anything is sent where the map's own limits forbid a value."""
+        if outside := self.registers.outside(block, values):
+            raise DeviceRefused("rig", command, "; ".join(outside), "the limits stand in the rig's map")
 
     def _send(self, command: str, **values: float) -> int:
         """Put the command on the line, once; a lost reply is not an answer either way."""

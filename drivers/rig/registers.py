@@ -5,6 +5,7 @@ Nothing here talks to a device. A map is made from a file (`configs/rigs/*.yaml`
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,13 +23,19 @@ RANGES = {"u16": (0, 2**16 - 1), "i16": (-(2**15), 2**15 - 1), "u32": (0, 2**32 
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """One value of a block. `scale_ratio` times the raw integer is the value in `unit`; 0 keeps the raw integer."""
+    """One value of a block. `scale_ratio` times the raw number is the value in `unit`; 0 keeps the raw number.
+
+    A negative scale turns the sign: a rig that counts tension or height as positive. Values outside `low` to `high`, in
+    `unit`, are neither sent nor believed.
+    """
 
     name: str
     kind: Kind
     scale_ratio: float = 0.0
     unit: str = ""
     text_words_count: int = 0
+    low: float = -math.inf
+    high: float = math.inf
 
     @property
     def words_count(self) -> int:
@@ -68,6 +75,8 @@ class RegisterMap:
     """A rig's whole map. `faults` names the bits of the fault word from the lowest; `commands` are codes by name.
 
     With `exchange` the heartbeat is written and the status read in one request (function 23); without it in two.
+    `heartbeat_s` is the load cell's time for one conversion, 0 where it is not known: then its heartbeat must only
+    change. `clock_drift_ratio` is by how much the controller's clock may run faster or slower than the host's.
     """
 
     name: str
@@ -84,6 +93,8 @@ class RegisterMap:
     command_states: tuple[str, ...]
     reasons: tuple[str, ...]
     commands: Mapping[str, int] = field(default_factory=dict)
+    heartbeat_s: float = 0.0
+    clock_drift_ratio: float = 5e-4
 
     def decode(self, block: str, words: Sequence[int]) -> dict[str, Value]:
         """Return the block's values in their units; raise `BadReply` where the number of words is wrong."""
@@ -104,6 +115,16 @@ class RegisterMap:
         for register in self.blocks[block].registers:
             words += encode_value(register, values[register.name], self.word_order)
         return words
+
+    def outside(self, block: str, values: Mapping[str, Value]) -> list[str]:
+        """Return, in words, every value that lies outside the limits of its register."""
+        return [
+            f"{r.name} {value} {r.unit} is outside {r.low:g} to {r.high:g} {r.unit}"
+            for r in self.blocks[block].registers
+            if r.kind != "text"
+            and (value := values.get(r.name)) is not None
+            and not r.low <= float(value) <= r.high  # no number at all (nan) is outside too
+        ]
 
     def fault_names(self, bits: int) -> tuple[str, ...]:
         """Return the names of the set bits; a bit without a name is called by its number."""
@@ -135,7 +156,7 @@ def encode_value(register: Register, value: Value, word_order: str) -> list[int]
         number = round(float(number)) if register.scale_ratio else int(number)
         low, high = RANGES[register.kind]
         if not low <= number <= high:
-            unit = register.scale_ratio or 1
+            unit = abs(register.scale_ratio) or 1
             raise ValueError(f"{register.name} = {value} {register.unit} is outside {low * unit:g} to {high * unit:g}")
     raw = struct.pack(PACKING[register.kind], number)
     words = list(struct.unpack(f">{len(raw) // 2}H", raw))

@@ -33,11 +33,9 @@ def _laser(bench_name: str, purpose: str) -> Iterator[tuple[Laser, Bench]]:
 
 
 def _place(report: Report) -> str:
-    from drivers.grbl.meanings import alarm_meaning
-
     where = report.machine_mm or report.work_mm
     text = f"{report.state}" + (f"  X{where[0]:.3f} Y{where[1]:.3f} mm" if where else "")
-    return text + (f"  (locked: {alarm_meaning(11)[1]} or unlock it)" if report.state == "Alarm" else "")
+    return text + ("  (locked: home it or unlock it)" if report.state == "Alarm" else "")
 
 
 def _facts(report: Report) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +14,7 @@ import click
 from fabctl.cli.common import json_option, lab, progress, say, show
 
 if TYPE_CHECKING:
-    from design.cells.compare import Comparison
+    from design.cells.compare import Comparison, Unanswered
     from design.cells.homogenise import Cell, Failure
     from design.cells.library import CellLibrary
     from design.cells.sheet import Sheet
@@ -27,6 +28,7 @@ file_option = click.option(
 )
 t_option = click.option("--t-mm", type=float, required=True, help="Where slit 1 starts on its edge.")
 theta_option = click.option("--theta-deg", type=float, required=True, help="Direction of slit 1.")
+TOLD_ROWS_COUNT = 10  # of the rows without numbers, for a person
 jobs_option = click.option("--jobs", type=int, default=-1, show_default=True, help="Processes; -1 is one per core.")
 
 
@@ -65,6 +67,7 @@ def build(
     as_json: bool,
 ) -> None:
     """Simulate every cell of a sheet; goes on where an earlier build stopped."""
+    processes = _processes(jobs)
     from design.cells.library import load_library, save_library
     from design.cells.sweep import plan_of, sweep
 
@@ -73,7 +76,7 @@ def build(
     parts = lab().root / "library-cache"
     report = _progress()
     try:
-        cells = sweep(plan, parts, jobs=_processes(jobs), cluster=cluster, report=report)
+        cells = sweep(plan, parts, jobs=processes, cluster=cluster, report=report)
     except KeyboardInterrupt:
         say(f"stopped; finished columns are kept in {parts / plan.key()[:16]}, the same command goes on from there")
         raise
@@ -84,8 +87,13 @@ def build(
 
 
 def _processes(jobs: int) -> int:
-    import os
+    """Return how many processes work, each with one thread.
 
+    The matrices of a cell are too small to share: with two threads of BLAS a column costs half as much processor time
+    again. Called before NumPy is loaded, which reads these once; joblib's workers inherit them.
+    """
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     return len(os.sched_getaffinity(0)) if jobs == -1 else max(jobs, 1)
 
 
@@ -110,6 +118,7 @@ def _summary(library: CellLibrary) -> dict[str, Any]:
         "spread_ratio": high / low,
         "candidates": library.counts(),
         "reasons": library.reasons(),
+        "shallow_count": library.shallow_count(),
         "sheet": asdict(library.sheet),
         "hash": library.hash,
         "command": library.meta["command"],
@@ -117,9 +126,16 @@ def _summary(library: CellLibrary) -> dict[str, Any]:
 
 
 def _lines(library: CellLibrary) -> Iterator[str]:
+    from design.cells.homogenise import LEAST_WELL_RATIO
+
     low, high = library.range_ratio()
     sheet = library.sheet
     yield f"{len(library)} bistable cells, expansion {low:.4f} to {high:.4f} (spread {high / low:.3f})"
+    if shallow := library.shallow_count():
+        yield (
+            f"{shallow} more have a second state behind less than {LEAST_WELL_RATIO:.1%} of their energy: "
+            "not told from none on this mesh, and not in the range"
+        )
     yield "candidates: " + ", ".join(f"{count} {verdict}" for verdict, count in library.counts().items())
     yield from (f"  {count:5d} {reason}" for reason, count in library.reasons().items())
     yield (
@@ -235,6 +251,7 @@ def _numbers(cell: Cell, sheet: Sheet) -> dict[str, Any]:
 @json_option
 def compare(published: Path, material: str, file: Path | None, jobs: int, as_json: bool) -> None:
     """Compare with a PUBLISHED table: each row solved afresh, then the library interpolated."""
+    processes = _processes(jobs)
     import numpy as np
 
     from design.cells import compare as comparing
@@ -244,12 +261,12 @@ def compare(published: Path, material: str, file: Path | None, jobs: int, as_jso
 
     sheet = _sheet(material)
     try:
-        table = comparing.read_published(published.read_text(), sheet)
-    except (ValueError, IndexError) as fault:
+        table = comparing.read_published(published.read_text(encoding="utf-8"), sheet)
+    except (comparing.TableError, UnicodeDecodeError) as fault:
         raise UsageError(f"{published}: {fault}") from fault
     listen, total = progress(), len(table.t_mm)
     cells = comparing.solve_rows(
-        table, sheet, jobs=_processes(jobs), done=lambda n: listen(Event("progress", f"{n} of {total} rows", n / total))
+        table, sheet, jobs=processes, done=lambda n: listen(Event("progress", f"{n} of {total} rows", n / total))
     )
     subset = table.comparable(sheet)
     everything = np.ones(total, dtype=bool)
@@ -269,7 +286,20 @@ def compare(published: Path, material: str, file: Path | None, jobs: int, as_jso
     result["verdicts"] = comparing.verdicts(cells)
     lines.append("solved rows: " + ", ".join(f"{n} {verdict}" for verdict, n in result["verdicts"].items()))
     lines += [f"  worst: {row}" for row in result.get("solved_comparable", result["solved_all"])["worst"]]
+    for way, silent in (
+        ("solved", comparing.unanswered(cells)),
+        ("interpolated", comparing.outside(table, ways["interpolated"][0])),
+    ):
+        result[f"{way}_unanswered"] = [asdict(row) for row in silent]
+        lines += _unanswered(way, silent)
     show(_finite(result), as_json, lines)
+
+
+def _unanswered(way: str, rows: list[Unanswered]) -> Iterator[str]:
+    for row in rows[:TOLD_ROWS_COUNT]:
+        yield f"  {way}, row {row.row}: t {row.t_mm:.4f} mm, θ {row.theta_deg:.3f}° is {row.verdict}: {row.reason}"
+    if len(rows) > TOLD_ROWS_COUNT:
+        yield f"  {way}: {len(rows) - TOLD_ROWS_COUNT} more rows without numbers; --json names them all"
 
 
 def _worst(table: Any, numbers: Any, row: int) -> dict[str, float]:

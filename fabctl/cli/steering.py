@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import select
 import signal
 import sys
@@ -53,14 +54,20 @@ class Keys:
     def wish(self) -> Wish:
         """Return what the operator wants now."""
         while self._terminal is not None and select.select([sys.stdin], [], [], 0)[0]:
-            key = sys.stdin.read(1)
+            keys = os.read(sys.stdin.fileno(), 64)  # past Python's own buffer, in which a second key would wait
+            if not keys:
+                break
+            self._press(keys.decode(errors="ignore"))
+        return self._wish
+
+    def _press(self, keys: str) -> None:
+        for key in keys:
             if key in ("s", "q", "\x1b"):
                 self._wish = "stop"
-            elif key == " ":
+            elif key == " " and self._wish != "stop":  # a stop is not taken back
                 self._wish = "go" if self._wish == "pause" else "pause"
             elif key in ("\n", "\r"):
                 self._answered = True
-        return self._wish
 
     def go_on(self, message: str) -> bool:
         """Tell whether the operator has answered the wait; without a terminal nobody can, and it goes on at once."""
@@ -87,7 +94,7 @@ class Keys:
 
     def _draw(self, event: Event) -> None:
         depth, force = event.data.get("depth_mm"), event.data.get("force_N")
-        if event.data.get("step") == "load" and depth is not None and force is not None:
+        if event.data.get("step") in ("load", "unload") and depth is not None and force is not None:
             self._curve.append((depth, force))
         elif event.data.get("step") in ("approach", "travel"):
             self._curve.clear()

@@ -7,6 +7,7 @@ schema as people expect it: `1e3` is a number and `on` is a word.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -64,7 +65,7 @@ def parse(text: str, model: type[M], name: str) -> M:
     try:
         checked = model.model_validate(data)
     except ValidationError as fault:
-        complaints += [_complaint(error, marks, name) for error in fault.errors()]
+        complaints += _complaints(fault.errors(), data, marks, name)
     if complaints:
         raise ConfigError(sorted(complaints, key=_line_number))
     return checked
@@ -100,10 +101,28 @@ def _scalar(node: yaml.Node) -> Any:
     return text
 
 
-def _complaint(error: Any, marks: Marks, name: str) -> str:
-    path = tuple(error["loc"])
+def _complaints(errors: Sequence[Any], data: Any, marks: Marks, name: str) -> list[str]:
+    """Return a line for each error; where a key takes several kinds, only the kind that was meant speaks."""
+    found = [(_keys(error, data), error) for error in errors]
+    deep = {path[:k] for path, _ in found for k in range(len(path))}
+    meant = [(path, error) for path, error in found if not (path in deep and isinstance(error["input"], dict))]
+    return list(dict.fromkeys(_complaint(path, error, marks, name) for path, error in meant))
+
+
+def _keys(error: Any, data: Any) -> tuple[str | int, ...]:
+    """Return where `error` lies in the file: pydantic puts names of types between the keys."""
+    path: list[str | int] = []
+    for key in error["loc"]:
+        if key in data if isinstance(data, dict) else isinstance(data, tuple) and isinstance(key, int):
+            path.append(key)
+            data = data[key]
+    return (*path, error["loc"][-1]) if error["type"] == "missing" else tuple(path)
+
+
+def _complaint(path: tuple[str | int, ...], error: Any, marks: Marks, name: str) -> str:
     line = next((marks[path[:k]] for k in range(len(path), -1, -1) if path[:k] in marks), 1)
-    text = "unknown key" if error["type"] == "extra_forbidden" else str(error["msg"])
+    told = {"extra_forbidden": "unknown key", "model_type": "a mapping of keys was expected"}
+    text = told.get(error["type"], str(error["msg"]))
     if error["type"] not in ("missing", "extra_forbidden") and not isinstance(error["input"], dict | tuple):
         text += f", not {error['input']!r}"
     return f"{name}:{line}: {_dotted(path)}: {text}" if path else f"{name}:{line}: {text}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -37,13 +38,24 @@ Word = Annotated[int, BeforeValidator(_number), Field(ge=0, lt=2**16)]
 
 
 class RegisterConfig(Model):
-    """One value. `scale` times the raw integer is the value in `unit`; without it the raw integer counts."""
+    """One value. `scale` times the raw number is the value in `unit` (negative: the sign is turned).
+
+    Without `scale` the raw number counts. What is outside `min` to `max` is neither sent nor believed.
+    """
 
     name: str
     kind: Literal["u16", "i16", "u32", "i32", "f32", "text"]
-    scale: Annotated[float, Field(ge=0)] = 0.0
+    scale: Annotated[float, Field(allow_inf_nan=False)] = 0.0
     unit: str = ""
     words: Annotated[int, Field(ge=0, le=32)] = 0
+    min: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    max: Annotated[float, Field(allow_inf_nan=False)] | None = None
+
+    def register(self) -> Register:
+        """Return it as the driver takes it."""
+        low = -math.inf if self.min is None else self.min
+        high = math.inf if self.max is None else self.max
+        return Register(self.name, self.kind, self.scale, self.unit, self.words, low, high)
 
 
 class BlockConfig(Model):
@@ -65,6 +77,8 @@ class RigMapConfig(Model):
     tick_s: Annotated[float, Field(gt=0)]
     timeout_s: Annotated[float, Field(gt=0)]
     response_max_s: Annotated[float, Field(gt=0)]
+    heartbeat_s: Annotated[float, Field(ge=0)] = 0.0
+    clock_drift_ratio: Annotated[float, Field(gt=0, lt=0.1)] = 5e-4
     states: tuple[str, ...]
     faults: Annotated[tuple[str, ...], Field(max_length=16)]
     command_states: tuple[str, ...]
@@ -102,7 +116,7 @@ class RigMapConfig(Model):
             name: Block(
                 table=block.table,
                 address=block.address,
-                registers=tuple(Register(r.name, r.kind, r.scale, r.unit, r.words) for r in block.registers),
+                registers=tuple(r.register() for r in block.registers),
             )
             for name, block in self.blocks.items()
         }
@@ -121,6 +135,8 @@ class RigMapConfig(Model):
             command_states=self.command_states,
             reasons=self.reasons,
             commands=dict(self.commands),
+            heartbeat_s=self.heartbeat_s,
+            clock_drift_ratio=self.clock_drift_ratio,
         )
 
 

@@ -201,8 +201,8 @@ def arc_points(
         sweep -= 2 * math.pi
     elif not clockwise and sweep <= 5e-7:
         sweep += 2 * math.pi
-    chord_mm = math.sqrt(max(tolerance_mm * (2 * radius - tolerance_mm), 1e-12))
-    count = int(abs(0.5 * sweep * radius) / chord_mm)
+    square = tolerance_mm * (2 * radius - tolerance_mm)
+    count = int(abs(0.5 * sweep * radius) / math.sqrt(square)) if square > 0 else 0
     points = []
     for k in range(1, count):
         cosine, sine = math.cos(sweep * k / count), math.sin(sweep * k / count)

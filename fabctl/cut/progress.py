@@ -11,7 +11,9 @@ from fabctl.cut.estimate import Estimate
 from fabctl.cut.program import Program, Step
 
 NEAR_MM = 0.05
+LEAST_AHEAD_S = 0.15  # of burning is always sent ahead: two reports and their way back; less would stutter
 LOST_MM = 1.0
+SLACK_MM = 0.05  # a report is rounded, and the place it names lies a little behind the line it ended
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +78,32 @@ class Track:
     def __post_init__(self) -> None:
         self._last_step = last_steps(self.program)
         self.line_end_s = [self.times.end_s[k] if k >= 0 else 0.0 for k in self._last_step]
+        self._burnt_mm, self._stroke_mm = burnt_mm(self.program.steps)
+        self._line_burnt_mm = [self._burnt_mm[k + 1] for k in self._last_step]
 
     def limit_count(self) -> int:
-        """Return how many lines may have been sent so that the board never holds more than `max_run_on_s` of work."""
+        """Return how many lines may have been sent.
+
+        So many that the board never holds more than `max_run_on_s` of work, nor more burning beyond the place it last
+        reported than one stroke: should its position be lost, no more than that can be burnt twice.
+        """
         allowed = bisect_right(self.line_end_s, self.done_s + self.max_run_on_s)
+        allowed = min(allowed, bisect_right(self._line_burnt_mm, self._burn_limit_mm()))
         return max(allowed, self._first_open_line() + 1)
+
+    def _burn_limit_mm(self) -> float:
+        """Return the burnt length, from the program's begin, up to which lines may be sent."""
+        if not self.program.steps:
+            return math.inf
+        k = min(bisect_right(self.times.end_s, self.done_s), len(self.program.steps) - 1)
+        step, done = self.program.steps[k], self._burnt_mm[k]
+        if self.place is not None and self.place.step_index == k and step.burns:
+            done += step.length_mm * self.place.along_ratio
+        ahead = bisect_right(self._burnt_mm, self._burnt_mm[k + 1])  # the first step that burns after this one
+        next_mm = self._stroke_mm[ahead - 1] if ahead <= len(self._stroke_mm) else 0.0
+        cut = step if step.burns or not next_mm else self.program.steps[ahead - 1]
+        least_mm = LEAST_AHEAD_S * cut.speed_mm_s if math.isfinite(cut.speed_mm_s) else 0.0
+        return done + max(self._stroke_mm[k], next_mm, least_mm) + SLACK_MM
 
     def _first_open_line(self) -> int:
         return bisect_right(self.line_end_s, self.done_s)
@@ -110,6 +133,19 @@ class Track:
     def done_frac(self) -> float:
         """Return the share of the estimated time that is over."""
         return min(self.done_s / self.times.total_s, 1.0) if self.times.total_s > 0 else 0.0
+
+
+def burnt_mm(steps: Sequence[Step]) -> tuple[list[float], list[float]]:
+    """Return the length burnt before each step and after the last, and the length of the stroke each step is in."""
+    burnt, strokes = [0.0], [0.0] * len(steps)
+    first = 0
+    for k, step in enumerate(steps):
+        burnt.append(burnt[-1] + (step.length_mm if step.burns else 0.0))
+        if not step.burns:
+            first = k + 1
+        elif k + 1 == len(steps) or not steps[k + 1].burns:
+            strokes[first : k + 1] = [burnt[-1] - burnt[first]] * (k + 1 - first)
+    return burnt, strokes
 
 
 def last_steps(program: Program) -> list[int]:

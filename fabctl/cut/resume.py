@@ -1,7 +1,7 @@
 """Go on with a cut that was interrupted: from its record and from where the machine is, never from memory. **W**
 
 While the position holds, the cut goes on from exactly there. Where it was lost, the machine is homed first, and the cut
-goes on from the beginning of the stroke that the last report lay in. Asked before anything moves.
+goes on from the place it reported last. Asked before anything moves.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from fabctl.cut.plan import CutPlan, program_times
 from fabctl.cut.preflight import preflight
 from fabctl.cut.program import read_program
 from fabctl.cut.progress import Place
-from fabctl.cut.trail import burnt_before_mm, read_trail, rest_of, stopped_at, stroke_start
+from fabctl.cut.trail import burnt_before_mm, last_seen, read_trail, rest_of, stopped_at
 from fabctl.cut.wirelog import WireLog
 from fabctl.errors import RefusedError, Stopped, UsageError
 from fabctl.events import Event
@@ -131,7 +131,7 @@ def _plan_rest(laser: Laser, bench: Bench, order: CutOrder, before: RunFolder) -
                 f"the machine's position was lost ({report.state} at {report.machine_mm})",
                 "home the machine, or register the sheet by camera",
             )
-        place = stroke_start(trail, program)
+        place = last_seen(trail, program)
     rest = read_program(rest_of(program, place))
     (xx, xy, x), (yx, yy, y) = recorded_config["placement"]
     affine = Affine(xx, xy, x, yx, yy, y)
@@ -151,7 +151,8 @@ def _question(before: RunFolder, plan: CutPlan, place: Place, will_home: bool) -
     total_mm = sum(step.length_mm for step in whole.steps if step.burns)
     done_mm = min(burnt_before_mm(whole, place), total_mm)
     how = (
-        "its position was lost: it homes first, and the stroke it was in is cut again from its beginning"
+        "its position was lost: it homes first, and goes on from where it was seen last, so that at most one stroke "
+        "is cut twice"
         if will_home
         else "the machine still stands where it stopped, and goes on from exactly there"
     )

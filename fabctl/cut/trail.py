@@ -14,6 +14,7 @@ MARK = "#"  # direction of a row in `wire.log` that is no byte but a remark
 PROGRAM_BEGINS = "program begins"
 EXACT_MM = 0.01  # two steps of a usual machine, and the rounding of its report
 POWER_UP_MM = 0.0005
+OVERLAP_MM = 0.1  # cut again before the last place seen: homing finds its switches only to about this
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +44,7 @@ def read_trail(text: str, program: Program, times: Estimate, work_offset_mm: Vec
         for message in listener.feed(data) if direction == "<" else ():
             if isinstance(message, Ok):
                 answered += 1
-            elif isinstance(message, Report) and message.machine_mm is not None:
-                point = _work(message.machine_mm, work_offset_mm)
+            elif isinstance(message, Report) and (point := _point(message, work_offset_mm)) is not None:
                 expected_s = place.t_s + t_s - seen_s if place else 0.0
                 first = place.step_index if place else 0
                 found = locate(program.steps, times, point, first, last[written], expected_s)
@@ -53,8 +53,11 @@ def read_trail(text: str, program: Program, times: Estimate, work_offset_mm: Vec
     return Trail(True, written, answered, place)
 
 
-def _work(machine_mm: Vector, offset_mm: Vector) -> tuple[float, float]:
-    return machine_mm[0] - offset_mm[0], machine_mm[1] - offset_mm[1]
+def _point(report: Report, offset_mm: Vector) -> tuple[float, float] | None:
+    """Return where the machine stood, work coordinates; None where the report does not say."""
+    if report.machine_mm is not None:
+        return report.machine_mm[0] - offset_mm[0], report.machine_mm[1] - offset_mm[1]
+    return report.work_mm[:2] if report.work_mm is not None else None
 
 
 def stopped_at(
@@ -65,25 +68,31 @@ def stopped_at(
     Trusted is a board that is not locked and stands exactly on the path, between the last place seen and the last line
     written; not the bare zero of a board that has just been switched on. `elapsed_s` is the time since the last byte.
     """
-    if report.state != "Idle" or report.machine_mm is None:
+    point = _point(report, work_offset_mm)
+    if report.state != "Idle" or point is None:
         return None
-    x, y, _ = report.machine_mm
+    x, y = point[0] + work_offset_mm[0], point[1] + work_offset_mm[1]
     if abs(x) < POWER_UP_MM and abs(y) < POWER_UP_MM:
         return None
     last = ([-1, *last_steps(program)])[trail.written_count]
     first = trail.place.step_index if trail.place else 0
     end_s = times.end_s[last] if last >= 0 else 0.0
     expected_s = min((trail.place.t_s if trail.place else 0.0) + elapsed_s, end_s)
-    found = locate(program.steps, times, _work(report.machine_mm, work_offset_mm), first, last, expected_s)
+    found = locate(program.steps, times, point, first, last, expected_s)
     return found if found is not None and found.off_mm <= EXACT_MM else None
 
 
-def stroke_start(trail: Trail, program: Program) -> Place:
-    """Return the beginning of the stroke in which the machine was seen last: where to go on with the position lost."""
-    k = trail.place.step_index if trail.place is not None else 0
-    while k > 0 and program.steps[k].burns and program.steps[k - 1].burns:
-        k -= 1
-    return Place(k, 0.0, 0.0, 0.0)
+def last_seen(trail: Trail, program: Program) -> Place:
+    """Return the place where the machine was seen last, a little before it: where to go on with the position lost.
+
+    Everything before it is surely burnt. What the board held beyond it may be: the lines were held back so that this
+    is at most one stroke, which is cut again.
+    """
+    if trail.place is None:
+        return Place(0, 0.0, 0.0, 0.0)
+    step = program.steps[trail.place.step_index]
+    back = OVERLAP_MM / step.length_mm if step.length_mm > 0 else 1.0
+    return Place(trail.place.step_index, max(trail.place.along_ratio - back, 0.0), 0.0, trail.place.t_s)
 
 
 def rest_of(program: Program, place: Place) -> tuple[str, ...]:

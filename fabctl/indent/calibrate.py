@@ -141,7 +141,7 @@ def calibrate_force(
             gain_se_ratio=body["gain_se_ratio"],
             force_run=run.run_id,
             force_utc=datetime.now(UTC).isoformat(),
-            valid_days_count=valid_days_count,
+            force_valid_days_count=valid_days_count,
         ),
     )
     run.write_result(body)
@@ -184,7 +184,7 @@ def calibrate_frame(
             compliance_se_mm_N=body["compliance_se_mm_N"],
             frame_run=run.run_id,
             frame_utc=datetime.now(UTC).isoformat(),
-            valid_days_count=valid_days_count,
+            frame_valid_days_count=valid_days_count,
         ),
     )
     run.write_result(body)

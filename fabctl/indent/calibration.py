@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -48,6 +48,17 @@ class Calibration:
     frame_run: str | None = None
     frame_utc: str | None = None
     valid_days_count: int = VALID_DAYS
+    force_valid_days_count: int | None = None  # each its own; None: as `valid_days_count` says
+    frame_valid_days_count: int | None = None
+
+    def ends(self, word: Literal["force", "frame"]) -> datetime | None:
+        """Return when the calibration of force or frame is past its date, None where there is none."""
+        date = self.force_utc if word == "force" else self.frame_utc
+        days_count = self.force_valid_days_count if word == "force" else self.frame_valid_days_count
+        if date is None:
+            return None
+        days_count = self.valid_days_count if days_count is None else days_count
+        return datetime.fromisoformat(date) + timedelta(days=days_count)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON."""
@@ -56,17 +67,17 @@ class Calibration:
     def findings(self, now: datetime | None = None) -> list[Finding]:
         """Return what is missing or past its date."""
         found = []
-        for what, value, date in (
-            ("load cell", self.gain_ratio, self.force_utc),
-            ("frame", self.compliance_mm_N, self.frame_utc),
-        ):
-            word = "force" if what == "load cell" else "frame"
-            if value is None or date is None:
+        words: tuple[tuple[str, float | None, Literal["force", "frame"]], ...] = (
+            ("load cell", self.gain_ratio, "force"),
+            ("frame", self.compliance_mm_N, "frame"),
+        )
+        for what, value, word in words:
+            ends = self.ends(word)
+            if value is None or ends is None:
                 found.append(
                     Finding(f"RIG-NO-{word.upper()}", f"the {what} is not calibrated", "warning", hint=_hint(word))
                 )
                 continue
-            ends = datetime.fromisoformat(date) + timedelta(days=self.valid_days_count)
             if (now or datetime.now(UTC)) > ends:
                 text = f"the calibration of the {what} ended on {ends.date()}"
                 found.append(Finding(f"RIG-{word.upper()}-EXPIRED", text, "warning", hint=_hint(word)))

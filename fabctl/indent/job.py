@@ -24,6 +24,7 @@ from fabctl.indent.calibration import Calibration, load_calibration
 from fabctl.indent.method import Action, Predicted, actions, check, read_predicted, time_s
 from fabctl.indent.recorder import Recorder
 from fabctl.indent.run import Ending, Runner, Wish, resumed
+from fabctl.priority import before_other_work
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Specimen, Workspace
 
@@ -130,9 +131,8 @@ def run_test(
         both = _both(log, emit)
         emit(Event("stage", f"run {run.run_id}"))
         try:
-            recorder = Recorder(run.path / "samples.csv")
-            try:
-                runner = Runner(
+            with before_other_work(), contextlib.closing(Recorder(run.path / "samples.csv")) as recorder:
+                ending = Runner(
                     rig,
                     plan.method,
                     plan.actions,
@@ -142,10 +142,7 @@ def run_test(
                     both,
                     (steering or Steering()).wish,
                     (steering or Steering()).go_on,
-                )
-                ending = runner.execute()
-            finally:
-                recorder.close()
+                ).execute()
         except (Stopped, KeyboardInterrupt) as fault:
             run.finish("stopped", str(fault) or "stopped by the operator")
             raise

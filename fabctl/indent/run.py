@@ -296,6 +296,8 @@ class Runner:
     def _whole(self, begin: Callable[[], int]) -> Sample:
         """Carry a motion to its end; where the operator paused it, `begin` what is left anew."""
         while True:
+            if self.wish() == "pause":  # asked for while nothing moved: then nothing begins to
+                self._pause()
             found = self._finish(begin())
             if found is not None:
                 return found

@@ -6,9 +6,11 @@ import csv
 import io
 import re
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from fabctl.indent.calibration import Calibration
 from fabctl.indent.method import read_predicted
 from fabctl.records.folder import RunFolder, status_of
 from fabctl.reports.model import Fact, Figure, Step
@@ -39,10 +41,12 @@ def indent_step(run: RunFolder, design: Path) -> Step:
     notes = tuple(f"{f['level']}: {f['message']}" for f in result.get("findings", []))
     if outcome.get("status") != "done" and outcome.get("message"):
         notes = (str(outcome["message"]), *notes)
-    return Step("Indentation", status_of(run), summary, tuple(_facts(result, config)), figures, notes)
+    return Step(
+        "Indentation", status_of(run), summary, tuple(_facts(result, config, _started(manifest))), figures, notes
+    )
 
 
-def _facts(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[Fact]:
+def _facts(result: Mapping[str, Any], config: Mapping[str, Any], started: datetime | None) -> list[Fact]:
     found = []
     for key, label, unit in FIGURES:
         value = result.get(key)
@@ -61,11 +65,38 @@ def _facts(result: Mapping[str, Any], config: Mapping[str, Any]) -> list[Fact]:
     found.append(
         Fact("rig", f"{rig.get('model', '?')} no. {rig.get('serial', '?')}", f"at {config.get('sample_hz')} Hz")
     )
-    calibration = config.get("calibration")
-    found.append(Fact("calibration", "none" if calibration is None else str(calibration.get("made_utc", "known"))))
+    found += _calibration_facts(config.get("calibration"), started)
     for name, value in (config.get("conditions") or {}).items():
         label, _, unit = str(name).rpartition("_")
         found.append(Fact(label or str(name), f"{value:.4g} {unit}" if isinstance(value, float) else f"{value} {unit}"))
+    return found
+
+
+def _started(manifest: Mapping[str, Any]) -> datetime | None:
+    try:
+        return datetime.fromisoformat(str(manifest.get("started_utc")))
+    except ValueError:
+        return None
+
+
+def _calibration_facts(known: Mapping[str, Any] | None, started: datetime | None) -> list[Fact]:
+    """Return both calibrations with their uncertainty (k = 2) and date, flagged where the run began after it."""
+    if known is None:
+        return [Fact("calibration", "none", "forces as the controller shows them, the frame's give not taken off")]
+    calibration = Calibration(**known)
+    pairs: tuple[tuple[str, Literal["force", "frame"], float | None, float | None, str], ...] = (
+        ("load cell's gain", "force", calibration.gain_ratio, calibration.gain_se_ratio, ""),
+        ("frame's give", "frame", calibration.compliance_mm_N, calibration.compliance_se_mm_N, " mm/N"),
+    )
+    found = []
+    for label, word, value, se, unit in pairs:
+        ends = calibration.ends(word)
+        if value is None or ends is None:
+            found.append(Fact(label, "not calibrated"))
+            continue
+        past = started is not None and started > ends
+        note = f"PAST ITS DATE: ended on {ends.date()}" if past else f"valid to {ends.date()}"
+        found.append(Fact(label, f"{value:.5g} ± {2 * (se or 0.0):.2g}{unit}", note))
     return found
 
 

@@ -16,12 +16,12 @@ from simulators.grbl.machine import Asked, Machine, State
 from simulators.grbl.system import program
 
 BITS_PER_BYTE = 10  # 8N1
-RX_BYTES, TX_BYTES = 128, 104
+TX_BYTES = 104
 TICK_S = 1e-6  # shorter waits are none
 UART_BYTES = 2  # what the receiver's own registers hold while the program is deaf
 REAL_TIME = {0x3F: Asked.STATUS, 0x7E: Asked.START, 0x21: Asked.HOLD, 0x84: Asked.DOOR}
 RESET = 0x18
-MOTION_OVERRIDES, ACCESSORY_OVERRIDES = range(0x90, 0x98), range(0x99, 0xA1)
+MOTION_OVERRIDES, ACCESSORY_OVERRIDES = range(0x90, 0x98), range(0x99, 0xA2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,6 @@ class Board:
     machine: Machine = field(default_factory=Machine)
     baud: float | None = 115200
     trace: Callable[[Point], None] | None = None
-    rx_bytes: int = RX_BYTES
     rx_lost_count: int = 0
     _rx: deque[int] = field(default_factory=deque)
     _wire_free_s: float = 0.0
@@ -55,6 +54,7 @@ class Board:
         m = self.machine
         m.say, m.read, m.flush_rx, m.go_deaf = self._say, self._read, self._rx.clear, self._go_deaf
         m.rx_free = lambda: self.rx_bytes - len(self._rx)
+        self.rx_bytes = m.dialect.rx_bytes
         self._program = program(m)
         self._wire_in: list[tuple[float, int, int]] = []  # arrival, order, byte
         self._wire_out: deque[tuple[float, bytes]] = deque()  # departure, bytes
@@ -170,6 +170,8 @@ class Board:
             m.stepper.start(m.now_s)
         else:
             m.asked |= Asked.CYCLE_DONE
+        if m.memory.on(21):
+            m.watch_switches()
         self._note_beam()
 
     def _note_beam(self) -> None:

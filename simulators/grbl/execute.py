@@ -7,8 +7,18 @@ from collections.abc import Generator
 from dataclasses import replace
 
 from simulators.grbl import report
-from simulators.grbl.gcode import PLANES, Block, Fault, Vector, parse
-from simulators.grbl.machine import ALARM_PROBE_MISSED, ALARM_SOFT_LIMIT, ANY, Asked, Machine, Program, State
+from simulators.grbl.gcode import PLANES, Fault, parse
+from simulators.grbl.machine import (
+    ALARM_PROBE_BEFORE,
+    ALARM_PROBE_MISSED,
+    ALARM_SOFT_LIMIT,
+    ANY,
+    Asked,
+    Machine,
+    Program,
+    State,
+)
+from simulators.grbl.modes import Block, Parser, Vector
 from simulators.grbl.realtime import DWELL_STEP_S, poll, wake
 from simulators.grbl.settings import G28, G30
 
@@ -35,11 +45,11 @@ def run_line(m: Machine, line: str) -> Status:
     if m.parser.modes.coolant != modes.coolant:
         if m.state is not State.CHECK:
             yield from synchronise(m)
-            m.set_coolant(modes.coolant == 8)
+            m.set_coolant(modes.coolant)
         m.parser = replace(m.parser, modes=replace(m.parser.modes, coolant=modes.coolant))
     if block.action == "dwell":
         yield from _dwell(m, block.dwell_s)
-    _set_offsets(m, block)
+    yield from _set_offsets(m, block)
     m.parser = replace(m.parser, modes=replace(modes, flow=-1))
     if block.action in ("g28", "g30"):
         if block.axis_command:
@@ -63,27 +73,35 @@ def _set_speed(m: Machine, block: Block) -> Program:
         yield from spindle_sync(m, now.spindle, 0.0 if laser and not cuts else block.s_count)
 
 
-def _set_offsets(m: Machine, block: Block) -> None:
-    before = m.parser
+def _set_offsets(m: Machine, block: Block) -> Program:
+    """Change offsets in the firmware's order; a change waits for standstill, and so does a write to the memory."""
     if block.axis_command == "length":
         length = block.target_mm[2] if block.modes.tool_length == 43 else 0.0
-        m.parser = replace(m.parser, tool_length_mm=length)
-    if before.modes.system != block.modes.system:
-        m.parser = replace(m.parser, system_mm=m.memory.offsets_mm[block.modes.system])
+        if length != m.parser.tool_length_mm:
+            yield from _shift(m, replace(m.parser, tool_length_mm=length))
+    if m.parser.modes.system != block.modes.system:
+        system_mm = m.memory.offsets_mm[block.modes.system]
+        modes = replace(m.parser.modes, system=block.modes.system)
+        yield from _shift(m, replace(m.parser, modes=modes, system_mm=system_mm))
     if block.action == "g10":
+        yield from synchronise(m)
         m.memory.store_offset(block.system, block.second_mm)
         if block.system == block.modes.system:
-            m.parser = replace(m.parser, system_mm=block.second_mm)
-            m.wco_count = 0
+            yield from _shift(m, replace(m.parser, system_mm=block.second_mm))
     elif block.action in ("g28.1", "g30.1"):
+        yield from synchronise(m)
         m.memory.store_offset(G28 if block.action == "g28.1" else G30, m.parser.position_mm)
     elif block.action == "g92":
-        m.parser = replace(m.parser, g92_mm=block.target_mm)
+        yield from _shift(m, replace(m.parser, g92_mm=block.target_mm))
     elif block.action == "g92.1":
-        m.parser = replace(m.parser, g92_mm=(0.0, 0.0, 0.0))
-    changed = before.tool_length_mm != m.parser.tool_length_mm or before.modes.system != block.modes.system
-    if changed or block.action in ("g92", "g92.1"):
-        m.wco_count = 0
+        yield from _shift(m, replace(m.parser, g92_mm=(0.0, 0.0, 0.0)))
+
+
+def _shift(m: Machine, parser: Parser) -> Program:
+    """Take new offsets, wait for standstill, and let the next report show them."""
+    m.parser = parser
+    yield from synchronise(m)
+    m.wco_count = 0
 
 
 def synchronise(m: Machine) -> Program:
@@ -201,8 +219,8 @@ def _arc(m: Machine, block: Block, power: float) -> Program:
     else:
         sweep += 2 * math.pi if sweep <= ARC_EPSILON_RAD else 0.0
     tolerance = m.memory[12]
-    chord = math.sqrt(max(tolerance * (2 * block.radius_mm - tolerance), 1e-12))
-    count = int(abs(0.5 * sweep * block.radius_mm) / chord)
+    square = tolerance * (2 * block.radius_mm - tolerance)
+    count = int(abs(0.5 * sweep * block.radius_mm) / math.sqrt(square)) if square > 0 and not math.isnan(sweep) else 0
     if count and block.modes.feed_mode == 93:
         block.feed_mm_min *= count
         block.modes = replace(block.modes, feed_mode=94)
@@ -219,13 +237,20 @@ def _arc(m: Machine, block: Block, power: float) -> Program:
 
 
 def _probe(m: Machine, block: Block, power: float) -> Generator[float, None, bool]:
-    """Move towards a probe that nothing ever touches; G38.2 and G38.4 call that an alarm."""
+    """Move towards a probe that nothing ever touches; G38.2 and G38.4 call that an alarm.
+
+    Moving away from it (G38.4, G38.5) is one from the start: an open probe is already away.
+    """
     if m.state is State.CHECK:
         return True
     yield from synchronise(m)
     if m.aborted():
         return False
     m.probe_found = False
+    if m.probe_triggered(away=block.modes.motion in (384, 385)):
+        m.alarm = ALARM_PROBE_BEFORE
+        yield from poll(m)
+        return False
     yield from line_to(m, block.target_mm, block, power, rapid=False)
     m.asked |= Asked.START
     while True:
@@ -254,14 +279,14 @@ def _program_flow(m: Machine, flow: int) -> Program:
             m.asked |= Asked.HOLD
             yield from poll(m)
         return
-    now = replace(m.parser.modes, motion=1, plane=17, distance=90, feed_mode=94, system=0, spindle=5, coolant=9)
+    now = replace(m.parser.modes, motion=1, plane=17, distance=90, feed_mode=94, system=0, spindle=5, coolant=0)
     m.parser = replace(m.parser, modes=now)
     m.overrides.feed = m.overrides.rapid = m.overrides.spindle = 100
     if m.state is not State.CHECK:
         m.parser = replace(m.parser, system_mm=m.memory.offsets_mm[0])
         m.wco_count = 0
         m.set_spindle(5, 0.0)
-        m.set_coolant(False)
+        m.set_coolant(0)
     m.say("[MSG:Pgm End]\r\n")
 
 

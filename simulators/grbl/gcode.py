@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from simulators.grbl.modes import FLOOD, MIST, Block, Modes, Parser, Vector
 from simulators.grbl.settings import G28, G30, N_SYSTEMS, Memory
 from simulators.grbl.words import MM_PER_INCH, read_number
 
-Vector = tuple[float, float, float]
-ZERO: Vector = (0.0, 0.0, 0.0)
 MAX_LINE_NUMBER = 10_000_000
 PLANES = {17: (0, 1, 2), 18: (2, 0, 1), 19: (1, 2, 0)}  # first, second and normal axis
 NEVER_NEGATIVE = "FNPTS"
@@ -32,60 +31,6 @@ class Fault(Exception):
         self.code = code
 
 
-@dataclass(frozen=True, slots=True)
-class Modes:
-    """The modal state, as `$G` shows it. `motion` is 0 to 3, 80, or 382 to 385 for G38.2 to G38.5."""
-
-    motion: int = 0
-    system: int = 0
-    plane: int = 17
-    units: int = 21
-    distance: int = 90
-    feed_mode: int = 94
-    spindle: int = 5
-    coolant: int = 9
-    tool_length: int = 49
-    flow: int = -1
-
-
-@dataclass(frozen=True, slots=True)
-class Parser:
-    """Everything the parser remembers between lines."""
-
-    modes: Modes = Modes()
-    feed_mm_min: float = 0.0  # 1/min under G93
-    s_count: float = 0.0
-    tool: int = 0
-    position_mm: Vector = ZERO
-    system_mm: Vector = ZERO
-    g92_mm: Vector = ZERO
-    tool_length_mm: float = 0.0
-
-    def offset_mm(self) -> Vector:
-        """Return the work offset that is in force: machine minus work position."""
-        x, y, z = (a + b for a, b in zip(self.system_mm, self.g92_mm, strict=True))
-        return x, y, z + self.tool_length_mm
-
-
-@dataclass(slots=True)
-class Block:
-    """A line that passed: its modes and what it asks for."""
-
-    modes: Modes
-    feed_mm_min: float = 0.0
-    s_count: float = 0.0
-    tool: int = 0
-    has_axes: bool = False
-    action: str = ""  # one of "", dwell, g10, g28, g30, g28.1, g30.1, g53, g92, g92.1
-    axis_command: str = ""  # one of "", motion, other, length
-    target_mm: Vector = ZERO
-    second_mm: Vector = ZERO  # G28/G30 goal, G10 data, or the arc's centre from its start
-    radius_mm: float = 0.0
-    dwell_s: float = 0.0
-    system: int = 0
-    jog: bool = False
-
-
 class Values(dict[str, float]):
     """Letter to number; each in the unit its letter has."""
 
@@ -96,7 +41,7 @@ class _Words:
     groups: set[str] = field(default_factory=set)
     axis_command: str = ""
     action: str = ""
-    modes: Modes = Modes()
+    modes: Modes = field(default_factory=Modes)
 
     @property
     def axes(self) -> list[int]:
@@ -106,7 +51,7 @@ class _Words:
 def parse(line: str, parser: Parser, memory: Memory) -> Block:
     """Return what `line` asks for (upper case, no blanks, `$J=` taken off by the caller's flag); raise `Fault`."""
     jog = line.startswith("$J=")
-    words = _read(line[3:] if jog else line, parser.modes, jog)
+    words = _read(line[3:] if jog else line, parser.modes, jog, parser.has_mist)
     block = Block(modes=words.modes, action=words.action, axis_command=words.axis_command, jog=jog)
     block.has_axes = bool(words.axes)
     if words.axes and not block.axis_command:
@@ -137,7 +82,7 @@ def parse(line: str, parser: Parser, memory: Memory) -> Block:
     return block
 
 
-def _read(text: str, modes: Modes, jog: bool) -> _Words:
+def _read(text: str, modes: Modes, jog: bool, has_mist: bool) -> _Words:
     words = _Words(modes=replace(modes, motion=1, feed_mode=94) if jog else modes)
     at = 0
     while at < len(text):
@@ -148,14 +93,13 @@ def _read(text: str, modes: Modes, jog: bool) -> _Words:
         if found is None:
             raise Fault(BAD_NUMBER)
         value, at = found
-        whole = int(value) & 0xFF
-        hundredths = int(abs(100 * (value - int(value))) + 0.5)
         if letter == "G":
-            _command(words, *_g_word(words, whole, hundredths))
+            _command(words, *_g_word(words, *_whole_and_hundredths(value)))
         elif letter == "M":
+            whole, hundredths = _whole_and_hundredths(value)
             if hundredths:
                 raise Fault(NOT_INTEGER)
-            _command(words, *_m_word(words, whole))
+            _command(words, *_m_word(words, whole, has_mist))
         elif letter in "FIJKLNPRSTXYZ":
             if letter == "T" and value > 255:
                 raise Fault(TOO_LARGE)
@@ -167,6 +111,15 @@ def _read(text: str, modes: Modes, jog: bool) -> _Words:
         else:
             raise Fault(UNSUPPORTED)
     return words
+
+
+def _whole_and_hundredths(value: float) -> tuple[int, int]:
+    """Return a command's number as the firmware keeps it: one byte, and two for what that byte leaves."""
+    if not math.isfinite(value):
+        return 0, 1
+    whole = int(value) & 0xFF
+    left = 100 * (value - whole)
+    return whole, int(math.copysign(math.floor(abs(left) + 0.5), left)) & 0xFFFF
 
 
 def _command(words: _Words, group: str, left_over: int) -> None:
@@ -240,7 +193,7 @@ def _g_word(words: _Words, g: int, hundredths: int) -> tuple[str, int]:
     raise Fault(UNSUPPORTED)
 
 
-def _m_word(words: _Words, m: int) -> tuple[str, int]:
+def _m_word(words: _Words, m: int, has_mist: bool) -> tuple[str, int]:
     if m in (0, 1, 2, 30):
         if m != 1:
             words.modes = replace(words.modes, flow=m)
@@ -248,8 +201,9 @@ def _m_word(words: _Words, m: int) -> tuple[str, int]:
     if m in (3, 4, 5):
         words.modes = replace(words.modes, spindle=m)
         return "spindle", 0
-    if m in (8, 9):
-        words.modes = replace(words.modes, coolant=m)
+    if m in (8, 9) or (m == 7 and has_mist):
+        on = {7: words.modes.coolant | MIST, 8: words.modes.coolant | FLOOD}
+        words.modes = replace(words.modes, coolant=on.get(m, 0))
         return "coolant", 0
     raise Fault(UNSUPPORTED)
 
@@ -320,7 +274,7 @@ def _set_system(block: Block, words: _Words, xyz: list[float], parser: Parser, m
         raise Fault(NO_AXIS_WORDS)
     if not {"P", "L"} & set(words.values):
         raise Fault(WORD_MISSING)
-    number = int(words.values.get("P", 0.0))
+    number = int(words.values.get("P", 0.0)) & 0xFF
     if number > N_SYSTEMS:
         raise Fault(NO_SUCH_SYSTEM)
     how = int(words.values.get("L", 0.0)) & 0xFF
@@ -375,7 +329,8 @@ def _check_arc(block: Block, words: _Words, parser: Parser, used: set[str]) -> N
         height = 4.0 * radius * radius - x * x - y * y
         if height < 0:
             raise Fault(BAD_RADIUS)
-        ratio = -math.sqrt(height) / math.hypot(x, y)
+        across = math.hypot(x, y)
+        ratio = -math.sqrt(height) / across if across else math.nan  # a helix onto itself has no centre
         if block.modes.motion == 3:
             ratio = -ratio
         if radius < 0:

@@ -27,6 +27,7 @@ def home(m: Machine) -> Program:
         yield from _home_axes(m, axes)
     yield from poll(m)
     if not m.aborted():
+        m.homed = True
         m.sync_position()
 
 

@@ -7,7 +7,8 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass, field, replace
 from enum import Enum, Flag, auto
 
-from simulators.grbl.gcode import Modes, Parser
+from simulators.grbl.dialects import GRBL, Dialect
+from simulators.grbl.modes import Modes, Parser
 from simulators.grbl.planner import Overrides, Planner
 from simulators.grbl.settings import Memory
 from simulators.grbl.stepper import Pin, Stepper
@@ -87,6 +88,7 @@ class World:
     real_mm: tuple[float, float, float] = (-5.0, -5.0, -5.0)
     door_is_open: bool = False
     switch_stuck: bool = False
+    probe_touches: bool = False
 
 
 @dataclass
@@ -96,6 +98,7 @@ class Machine:
     memory: Memory = field(default_factory=Memory)
     world: World = field(default_factory=World)
     options: str = "V"
+    dialect: Dialect = GRBL
     now_s: float = 0.0
     state: State = State.IDLE
     asked: Asked = Asked.NOTHING
@@ -112,8 +115,9 @@ class Machine:
     parser: Parser = field(default_factory=Parser)
     pin: Pin = field(default_factory=Pin)
     shown_s_count: float = 0.0
-    flood: bool = False
-    probe_armed: bool = False
+    coolant: int = 0
+    homed: bool = False
+    switches_seen: set[int] = field(default_factory=set)
     probe_found: bool = False
     probe_steps: tuple[int, int, int] = (0, 0, 0)
     say: Callable[[str], None] = print
@@ -123,7 +127,7 @@ class Machine:
     go_deaf: Callable[[float], None] = lambda until_s: None
 
     def __post_init__(self) -> None:
-        self.planner = Planner(self.memory, self.overrides)
+        self.planner = Planner(self.memory, self.overrides, capacity_count=self.dialect.blocks_count)
         self.stepper = Stepper(self.planner, self.memory, self.pin, self.duty)
         self.planner.notify = self.stepper.look_again
 
@@ -165,10 +169,10 @@ class Machine:
             self.pin.power_frac = self.duty(0.0 if dark else speed)
         self.ov_count = 0
 
-    def set_coolant(self, flood: bool) -> None:
-        """Set the air assist pin."""
+    def set_coolant(self, coolant: int) -> None:
+        """Set the pins of M7 (mist, here the exhaust) and M8 (flood, here the air assist)."""
         if not self.abort:
-            self.flood = flood
+            self.coolant = coolant
             self.ov_count = 0
 
     def kill(self) -> None:
@@ -177,7 +181,7 @@ class Machine:
             return
         self.asked |= Asked.RESET
         self.spindle_off()
-        self.flood = False
+        self.coolant = 0
         moving = self.state in (State.RUN, State.HOMING, State.JOG)
         if moving or self.stepper.holding or self.stepper.system_move is not None:
             if self.state is State.HOMING:
@@ -196,12 +200,26 @@ class Machine:
         return x, y, z
 
     def limits_hit(self) -> set[int]:
-        """Return the axes whose switch is pressed."""
+        """Return the axes whose switch the board takes for pressed; `$5` turns the pins' meaning over."""
         if self.world.switch_stuck:
-            return {0, 1, 2}
-        if not self.world.switches:
-            return set()
-        return {k for k in range(3) if self.real_mm(k) >= 0}
+            pressed = {0, 1, 2}
+        elif self.world.switches:
+            pressed = {k for k in range(3) if self.real_mm(k) >= 0}
+        else:
+            pressed = set()
+        return {0, 1, 2} - pressed if self.memory.on(5) else pressed
+
+    def probe_triggered(self, away: bool = False) -> bool:
+        """Return whether the probe counts as met; moving `away` from contact, an open pin does. `$6` turns it over."""
+        return self.world.probe_touches ^ self.memory.on(6) ^ away
+
+    def watch_switches(self) -> None:
+        """Do what the limit pins' interrupt does under `$21`: any change kills, except in homing and alarm."""
+        now = self.limits_hit()
+        changed, self.switches_seen = now != self.switches_seen, now
+        if changed and self.state not in (State.ALARM, State.HOMING) and not self.alarm:
+            self.kill()
+            self.alarm = ALARM_HARD_LIMIT
 
     def real_mm(self, axis: int) -> float:
         """Return how far the head is past the switch of `axis`; negative while it has not reached it."""
@@ -231,9 +249,10 @@ class Machine:
         self.motion_override.clear()
         self.accessory_override.clear()
         self.wco_count = self.ov_count = 0
-        self.shown_s_count, self.flood = 0.0, False
+        self.shown_s_count, self.coolant = 0.0, 0
         self.spindle_off()
-        self.probe_steps, self.probe_found, self.probe_armed = (0, 0, 0), False, False
+        self.probe_steps, self.probe_found = (0, 0, 0), False
+        self.switches_seen = self.limits_hit()
         self.flush_rx()
-        self.parser = Parser(modes=Modes(), system_mm=self.memory.offsets_mm[0])
+        self.parser = Parser(modes=Modes(), system_mm=self.memory.offsets_mm[0], has_mist="M" in self.options)
         self.sync_position()

@@ -14,10 +14,12 @@ from simulators.clock import Clock
 from simulators.endpoints import PtyEndpoint, TcpEndpoint
 from simulators.faults import KINDS, Fault
 from simulators.grbl.board import Board, Point
+from simulators.grbl.dialects import DIALECTS
 from simulators.grbl.machine import Machine, World
 from simulators.grbl.settings import Memory
 
 LONGEST_WAIT_S = 0.02
+SHORTEST_WAIT_S = 0.0008  # nine bytes of a fast line: looking at each by itself would cost more than all the rest
 Trace = Callable[[Point], None]
 # A laser as a lab has it: 300 × 200 mm, homing at the far corner, laser mode on.
 LAB: dict[int, float] = {
@@ -67,7 +69,7 @@ def make_machine(options: argparse.Namespace) -> Machine:
     if options.lab:
         world.real_mm = (-40.0, -30.0, -5.0)
         memory.values[132] = 10.0
-    return Machine(memory=memory, world=world, options=options.options)
+    return Machine(memory=memory, world=world, options=options.options, dialect=DIALECTS[options.dialect])
 
 
 def _serve(endpoint: PtyEndpoint | TcpEndpoint, options: argparse.Namespace, trace: Trace | None) -> None:
@@ -82,7 +84,11 @@ def _serve(endpoint: PtyEndpoint | TcpEndpoint, options: argparse.Namespace, tra
         if fault is not None:
             out = _spoil(fault, out, now_s, board, endpoint)
         wait_s = min(board.next_event_s(), board.next_output_s()) - clock.now_s()
-        wait_s = min(max(clock.real_s(wait_s), 0.0), LONGEST_WAIT_S) if not math.isnan(wait_s) else LONGEST_WAIT_S
+        wait_s = (
+            min(max(clock.real_s(wait_s), SHORTEST_WAIT_S), LONGEST_WAIT_S)
+            if not math.isnan(wait_s)
+            else LONGEST_WAIT_S
+        )
         data, opened = endpoint.exchange(out, wait_s)
         if opened and options.dtr_reset:
             board.restart()
@@ -135,6 +141,7 @@ def _parse(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--switches", action="store_true", help="connect limit switches")
     parser.add_argument("--set", action="append", metavar="N=VALUE", help="change a setting before power-up")
     parser.add_argument("--options", default="V", help="the build options that $I shows")
+    parser.add_argument("--dialect", choices=sorted(DIALECTS), default="grbl", help="speak as this firmware does")
     parser.add_argument("--dtr-reset", action="store_true", help="restart when a host opens the line")
     parser.add_argument("--fault", choices=KINDS, help="let this fault happen once")
     parser.add_argument("--seed", type=int, default=0, help="seed of the fault's moment")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from simulators.grbl.gcode import Vector
+from simulators.grbl.modes import Vector
 from simulators.grbl.settings import Memory
 
 CAPACITY = 15
@@ -53,6 +53,7 @@ class Planner:
 
     memory: Memory
     overrides: Overrides
+    capacity_count: int = CAPACITY
     moves: list[Move] = field(default_factory=list)
     planned: int = 0
     position_steps: tuple[int, int, int] = (0, 0, 0)
@@ -63,7 +64,7 @@ class Planner:
     @property
     def full(self) -> bool:
         """Return whether no further move fits."""
-        return len(self.moves) >= CAPACITY
+        return len(self.moves) >= self.capacity_count
 
     def reset(self, position_steps: tuple[int, int, int]) -> None:
         """Forget every move; stand at `position_steps`."""
@@ -189,6 +190,8 @@ def _limit_entry(move: Move, nominal: float, before: float) -> None:
 
 
 def _round(value: float) -> int:
+    if not abs(value) < 2**31:
+        return -(2**31)  # what the firmware's library answers beyond its range
     return math.floor(abs(value) + 0.5) * (1 if value >= 0 else -1)
 
 

@@ -19,6 +19,7 @@ from simulators.grbl.machine import (
     State,
     Suspend,
 )
+from simulators.grbl.modes import FLOOD, MIST
 
 ALARM_PAUSE_S = 0.5
 DWELL_STEP_S = 0.050
@@ -79,6 +80,8 @@ def _raise_alarm(m: Machine) -> Program:
     code = m.alarm
     m.state = State.ALARM
     m.say(f"ALARM:{code}\r\n")
+    if m.dialect.after_alarm:
+        m.say(m.dialect.after_alarm.format(code=code) + "\r\n")
     yield m.now_s + ALARM_PAUSE_S
     if code in (ALARM_HARD_LIMIT, ALARM_SOFT_LIMIT):
         m.say("[MSG:Reset to continue]\r\n")
@@ -172,7 +175,7 @@ def _motion_overrides(m: Machine) -> None:
     if 0x90 in asked:
         feed = 100
     feed += sum(step for code, step in ((0x91, 10), (0x92, -10), (0x93, 1), (0x94, -1)) if code in asked)
-    feed = max(min(feed, 200), 10)
+    feed = max(min(feed & 0xFF, 200), 10)  # one byte, and so below nothing lies the most
     for code, value in ((0x95, 100), (0x96, 50), (0x97, 25)):
         rapid = value if code in asked else rapid
     if (feed, rapid) != (m.overrides.feed, m.overrides.rapid):
@@ -189,7 +192,7 @@ def _accessory_overrides(m: Machine) -> None:
     m.accessory_override.clear()
     power = 100 if 0x99 in asked else m.overrides.spindle
     power += sum(step for code, step in ((0x9A, 10), (0x9B, -10), (0x9C, 1), (0x9D, -1)) if code in asked)
-    power = max(min(power, 200), 10)
+    power = max(min(power & 0xFF, 200), 10)
     if power != m.overrides.spindle:
         m.overrides.spindle = power
         if m.state is State.IDLE:
@@ -202,16 +205,17 @@ def _accessory_overrides(m: Machine) -> None:
             m.spindle_stop = SpindleStop.BEGIN
         elif SpindleStop.ACTIVE in m.spindle_stop:
             m.spindle_stop |= SpindleStop.RESTORE
-    if 0xA0 in asked and m.state in (State.IDLE, State.RUN, State.HOLD, State.JOG):
-        on = m.parser.modes.coolant != 8
-        m.set_coolant(on)
-        m.parser = replace(m.parser, modes=replace(m.parser.modes, coolant=8 if on else 9))
+    turned = (FLOOD if 0xA0 in asked else 0) | (MIST if 0xA1 in asked and m.parser.has_mist else 0)
+    if turned and m.state in (State.IDLE, State.RUN, State.HOLD, State.JOG):
+        coolant = m.parser.modes.coolant ^ turned
+        m.set_coolant(coolant)
+        m.parser = replace(m.parser, modes=replace(m.parser.modes, coolant=coolant))
 
 
 def _suspended(m: Machine) -> Program:
     move = m.planner.moves[0] if m.planner.moves else None
     mode, speed = (move.spindle, move.s_count) if move else (m.parser.modes.spindle, m.parser.s_count)
-    flood = m.flood if move else m.parser.modes.coolant == 8
+    coolant = m.coolant if move else m.parser.modes.coolant
     if m.memory.on(32):
         m.accessory_override.append(0x9E)  # a hold in laser mode darkens the beam
     while m.suspend:
@@ -220,7 +224,7 @@ def _suspended(m: Machine) -> Program:
         before = (m.suspend, m.spindle_stop, m.state, m.asked)
         if Suspend.HELD in m.suspend:
             if m.state in (State.DOOR, State.SLEEP):
-                yield from _door_or_sleep(m, mode, speed, flood)
+                yield from _door_or_sleep(m, mode, speed, coolant)
                 if m.aborted():
                     return
             elif m.spindle_stop:
@@ -251,18 +255,18 @@ def _stop_or_restore(m: Machine, mode: int, speed: float) -> None:
         m.spindle_stop = SpindleStop.NONE
 
 
-def _door_or_sleep(m: Machine, mode: int, speed: float, flood: bool) -> Program:
+def _door_or_sleep(m: Machine, mode: int, speed: float, coolant: int) -> Program:
     if Suspend.RETRACTED not in m.suspend:
         m.spindle_stop = SpindleStop.NONE
         m.set_spindle(5, 0.0)
-        m.set_coolant(False)
+        m.set_coolant(0)
         m.suspend &= ~Suspend.RESTART_RETRACT
         m.suspend |= Suspend.RETRACTED
         return
     if m.state is State.SLEEP:
         m.say("[MSG:Sleeping]\r\n")
         m.set_spindle(5, 0.0)
-        m.set_coolant(False)
+        m.set_coolant(0)
         while not m.aborted():
             yield from _system(m)
             if not m.aborted():
@@ -277,8 +281,8 @@ def _door_or_sleep(m: Machine, mode: int, speed: float, flood: bool) -> Program:
             else:
                 m.set_spindle(mode, speed)
                 yield from _pause(m, DOOR_SPINDLE_S)
-        if m.parser.modes.coolant != 9 and Suspend.RESTART_RETRACT not in m.suspend:
-            m.set_coolant(flood)
+        if m.parser.modes.coolant and Suspend.RESTART_RETRACT not in m.suspend:
+            m.set_coolant(coolant)
             yield from _pause(m, DOOR_COOLANT_S)
         if Suspend.RESTART_RETRACT not in m.suspend:
             m.suspend |= Suspend.RESTORED

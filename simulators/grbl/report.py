@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from simulators.grbl.machine import BUSY, Machine, State, Suspend
+from simulators.grbl.modes import FLOOD, MIST
 from simulators.grbl.settings import N_SYSTEMS
 from simulators.grbl.words import coordinate, decimals, rate
 
-BANNER = "Grbl 1.1h ['$' for help]"
 HELP = "[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]"
+CHECK_LIMITS = "[MSG:Check Limits]"
 LOCKED = "[MSG:'$H'|'$X' to unlock]"
-BUFFER_BLOCKS, BUFFER_BYTES = 15, 128
 WCO_BUSY, WCO_IDLE, OV_BUSY, OV_IDLE = 30, 10, 20, 10
 
 
@@ -23,10 +23,10 @@ def status(m: Machine) -> str:
         name, position = "WPos", _minus(position, offset)
     fields = [_state(m), f"{name}:{_vector(position, inches)}"]
     if mask & 2:
-        fields.append(f"Bf:{BUFFER_BLOCKS - len(m.planner.moves)},{m.rx_free()}")
+        fields.append(f"Bf:{m.dialect.blocks_count - len(m.planner.moves)},{m.rx_free()}")
     speed = m.stepper.speed_mm_s * 60 if m.state in BUSY else 0.0
     fields.append(f"FS:{rate(speed, inches)},{decimals(m.shown_s_count, 0)}")
-    pins = "".join("XYZ"[k] for k in sorted(m.limits_hit()))
+    pins = ("P" if m.probe_triggered() else "") + "".join("XYZ"[k] for k in sorted(m.limits_hit()))
     if pins:
         fields.append(f"Pn:{pins}")
     busy = m.state in BUSY
@@ -36,12 +36,15 @@ def status(m: Machine) -> str:
         m.wco_count = (WCO_BUSY if busy else WCO_IDLE) - 1
         m.ov_count = m.ov_count or 1
         fields.append(f"WCO:{_vector(offset, inches)}")
+        if m.dialect.homed_field and m.memory.on(22):
+            fields.append(f"H:{int(m.homed)}")
     if m.ov_count > 0:
         m.ov_count -= 1
     else:
         m.ov_count = (OV_BUSY if busy else OV_IDLE) - 1
         fields.append(f"Ov:{m.overrides.feed},{m.overrides.rapid},{m.overrides.spindle}")
-        on = ("" if m.pin.power_frac == 0 else "C" if m.pin.ccw else "S") + ("F" if m.flood else "")
+        on = "" if m.pin.power_frac == 0 else "C" if m.pin.ccw else "S"
+        on += ("F" if m.coolant & FLOOD else "") + ("M" if m.coolant & MIST else "")
         if on:
             fields.append(f"A:{on}")
     return f"<{'|'.join(fields)}>"
@@ -83,13 +86,14 @@ def modes(m: Machine) -> str:
     motion = f"G38.{now.motion % 10}" if now.motion > 380 else f"G{now.motion}"
     feed = rate(p.feed_mm_min, m.memory.on(13))
     words = [motion, f"G{54 + now.system}", f"G{now.plane}", f"G{now.units}", f"G{now.distance}", f"G{now.feed_mode}"]
-    words += [f"M{now.spindle}", f"M{now.coolant}", f"T{p.tool}", f"F{feed}", f"S{decimals(p.s_count, 0)}"]
+    air = [f"M{number}" for number, bit in ((7, MIST), (8, FLOOD)) if now.coolant & bit] or ["M9"]
+    words += [f"M{now.spindle}", *air, f"T{p.tool}", f"F{feed}", f"S{decimals(p.s_count, 0)}"]
     return f"[GC:{' '.join(words)}]"
 
 
 def build(m: Machine) -> list[str]:
     """Return the answer to `$I`."""
-    return [f"[VER:1.1h.20190830:{m.memory.build_note}]", f"[OPT:{m.options},{BUFFER_BLOCKS},{BUFFER_BYTES}]"]
+    return [line.format(note=m.memory.build_note, options=m.options) for line in m.dialect.build]
 
 
 def _vector(values: tuple[float, float, float], inches: bool) -> str:

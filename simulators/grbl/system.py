@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from simulators.grbl import report
-from simulators.grbl.execute import Status, run_line
+from simulators.grbl.execute import Status, run_line, synchronise
 from simulators.grbl.homing import home
 from simulators.grbl.machine import Asked, Machine, Program, State
 from simulators.grbl.realtime import poll
@@ -19,11 +19,16 @@ def program(m: Machine) -> Program:
         m.state = State.ALARM  # with homing on, the position is unknown until homed or unlocked
     while True:
         m.reinitialise()
-        m.say(f"\r\n{report.BANNER}\r\n")
+        for line in m.dialect.before_banner:
+            m.say(f"{line}\r\n")
+        m.say(f"\r\n{m.dialect.banner}\r\n")
         yield from _main_loop(m)
 
 
 def _main_loop(m: Machine) -> Program:
+    if m.memory.on(21) and m.limits_hit():
+        m.state = State.ALARM
+        m.say(f"{report.CHECK_LIMITS}\r\n")
     if m.state in (State.ALARM, State.SLEEP):
         m.say(f"{report.LOCKED}\r\n")
         m.state = State.ALARM
@@ -40,6 +45,8 @@ def _main_loop(m: Machine) -> Program:
                     return
                 status = OVERFLOW if overflow else (yield from _dispatch(m, line))
                 yield from _deaf_while_writing(m)
+                if status != OK and m.dialect.before_error:
+                    m.say(m.dialect.before_error.format(code=status) + "\r\n")
                 m.say("ok\r\n" if status == OK else f"error:{status}\r\n")
                 line, comment, overflow = "", "", False
             elif comment or overflow:
@@ -196,6 +203,7 @@ def _store(m: Machine, line: str, startup: bool) -> Status:
     if startup:
         status = yield from run_line(m, line[at + 1 :])
         if status == OK:
+            yield from synchronise(m)
             m.memory.store_startup(int(index), line[at + 1 :])
         return status
     value = read_number(line, at + 1)

@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+import math
 import struct
+from functools import lru_cache
 
 MAX_DIGITS = 8  # further digits only shift the decimal point
 MM_PER_INCH = 25.4
 
 
 def f32(value: float) -> float:
-    """Return `value` rounded to single precision, which is all the board has."""
-    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+    """Return `value` rounded to single precision, which is all the board has; infinite where that ends."""
+    try:
+        return float(struct.unpack("<f", struct.pack("<f", value))[0])
+    except OverflowError:
+        return math.copysign(math.inf, value)
+
+
+TENTH, HUNDREDTH = f32(0.1), f32(0.01)
+
+
+@lru_cache(maxsize=8192)
+def scaled(digits: int, exponent: int) -> float:
+    """Return digits · 10^exponent by the single-precision steps the board takes: hundredths first, then a tenth."""
+    value = f32(float(digits))
+    while exponent <= -2 and value:
+        value, exponent = f32(value * HUNDREDTH), exponent + 2
+    if exponent < 0:
+        value = f32(value * TENTH)
+    while exponent > 0 and value:
+        value, exponent = f32(value * 10.0), exponent - 1
+    return value
 
 
 def read_number(text: str, at: int) -> tuple[float, int] | None:
@@ -38,17 +59,19 @@ def read_number(text: str, at: int) -> tuple[float, int] | None:
         at += 1
     if not count:
         return None
-    value = f32(digits * 10.0**exponent)
+    value = scaled(digits, exponent)
     return (-value if negative else value), at
 
 
 def decimals(value: float, places: int) -> str:
     """Return `value` with `places` decimals, half rounded away from zero."""
-    scaled = int(abs(value) * 10**places + 0.5)
+    if not math.isfinite(value):
+        return "inf"  # no job comes here; the board prints whatever its registers hold
+    count = int(abs(value) * 10**places + 0.5)
     sign = "-" if value < 0 else ""
     if places == 0:
-        return f"{sign}{scaled}"
-    whole, part = divmod(scaled, 10**places)
+        return f"{sign}{count}"
+    whole, part = divmod(count, 10**places)
     return f"{sign}{whole}.{part:0{places}d}"
 
 

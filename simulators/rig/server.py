@@ -112,17 +112,17 @@ class Server:
         next_s = min([due_s for due_s, *_ in [*self._due, *self._waiting]], default=now_s + IDLE_S)
         handles = list(self._links) + ([self._listener.fileno()] if self._listener else [])
         ready, _, _ = select.select(handles, [], [], min(max(0.0, next_s - now_s), IDLE_S))
-        self._catch_up()
         for handle in ready:
             if self._listener is not None and handle == self._listener.fileno():
                 self._accept()
             elif handle in self._links:
                 self._hear(self._links[handle])
         self._serve_due()
+        self._catch_up(self._now_s())
         self._each_turn()
 
-    def _catch_up(self) -> None:
-        ticks_count = int((self._now_s() - self._ran_s) / TICK_S)
+    def _catch_up(self, until_s: float) -> None:
+        ticks_count = max(0, int((until_s - self._ran_s) / TICK_S))
         self.device.advance(ticks_count)
         self._ran_s += ticks_count * TICK_S
 
@@ -156,9 +156,10 @@ class Server:
 
     def _serve_due(self) -> None:
         now_s = self._now_s()
-        for item in [item for item in self._waiting if item[0] <= now_s]:
+        for item in sorted((item for item in self._waiting if item[0] <= now_s), key=lambda item: item[0]):
             self._waiting.remove(item)
-            self._catch_up()
+            # At the tick at which a controller has the whole request, not when this process was woken for it.
+            self._catch_up(item[0])
             self._serve(item[0], item[1], item[2])
         self._send_due()
 

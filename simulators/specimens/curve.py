@@ -115,7 +115,7 @@ def _refined(gap: object, a: float, at_a: float, b: float, at_b: float) -> float
     for _ in range(3):
         middle = _between(a, at_a, b, at_b)
         value = gap(middle)
-        if abs(value) < 1e-9:
+        if abs(value) < 1e-7:  # a tenth of a nanometre
             break
         if (value < 0) == (at_a < 0):
             a, at_a = middle, value

@@ -36,3 +36,13 @@ def test_a_restarted_board_is_not_believed_and_nothing_is_left_uncut(seed: int) 
     rig, rows, died_s = killed_run(seed, program)
     assert not resumed(rig, rows, program, died_s, restart=True)
     assert missing_count(rig, program) == 0
+    assert twice_mm(rig, program) <= SLIT_MM
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_board_that_ran_on_alone_and_then_restarted_burns_at_most_one_slit_twice(seed: int) -> None:
+    program = read_program(PROGRAM)
+    rig, rows, died_s = killed_run(seed, program, absence_s=8.0)
+    assert not resumed(rig, rows, program, died_s, restart=True)
+    assert missing_count(rig, program) == 0
+    assert twice_mm(rig, program) <= SLIT_MM

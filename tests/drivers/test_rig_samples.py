@@ -28,6 +28,13 @@ def block(sequence: int, request: int, heartbeat: int | None = None, **more: flo
     return [*words[:-1], check_word(words[:-1])]
 
 
+def lived(fresh: Freshness, replies_count: int = 5) -> Freshness:
+    """Return the judge after more good replies, 1015 to 1035 in steps of 5 ms: it knows the clocks to 2 ms now."""
+    for k in range(replies_count):
+        fresh.believe(block(1015 + 5 * k, 3 + k), asked(3 + k, 1.015 + 0.005 * k))
+    return fresh
+
+
 def asked(request: int, at_s: float) -> Asked:
     return Asked(request, at_s, at_s + 0.002)
 
@@ -129,3 +136,43 @@ def test_a_reply_during_which_the_host_stood_still_is_not_believed() -> None:
     # 0.19 s lie within the 0.6 s the question was open, but so would a sequence number that had jumped
     with pytest.raises(BadReply, match="host's clock"):
         awake().believe(block(1200, 3), Asked(3, 1.02, 1.62))
+
+
+def test_a_force_that_the_converter_stopped_renewing_is_not_believed_though_its_heartbeat_is_new_to_us() -> None:
+    # The reply with heartbeat 1040 was lost on the way; the next one repeats its force and heartbeat.
+    fresh = lived(awake())
+    with pytest.raises(BadReply, match="an old force"):
+        fresh.believe(block(1050, 9, heartbeat=1040), asked(9, 1.05))
+    assert fresh.believe(block(1060, 10), asked(10, 1.06)).sequence == 1060
+
+
+def test_the_heartbeat_may_be_one_conversion_off_and_wraps() -> None:
+    fresh = Freshness(MAP)
+    with pytest.raises(BadReply):
+        fresh.believe(block(65520, 1), asked(1, 1.0))
+    fresh.believe(block(65530, 2), asked(2, 1.01))
+    assert fresh.believe(block(65540, 3, heartbeat=5), asked(3, 1.02)).sequence == 65540
+
+
+def test_a_reading_a_few_milliseconds_older_than_its_request_is_not_believed() -> None:
+    fresh = lived(awake())
+    with pytest.raises(BadReply, match="its own request"):
+        fresh.believe(block(1042, 9), asked(9, 1.05))
+    assert fresh.believe(block(1060, 10), asked(10, 1.06)).sequence == 1060
+
+
+def test_slow_clocks_are_followed() -> None:
+    fresh = awake()
+    for k in range(1, 400):  # a controller whose clock is 300 ppm slow
+        host_s = 1.01 + 0.1 * k
+        fresh.believe(block(1010 + int(100 * k * (1 - 3e-4)), 2 + k), asked(2 + k, host_s))
+
+
+def test_bounds_from_a_first_reply_that_was_too_old_are_given_up_when_two_agree() -> None:
+    fresh = Freshness(MAP)
+    with pytest.raises(BadReply):
+        fresh.believe(block(985, 1), asked(1, 1.0))
+    fresh.believe(block(995, 2), asked(2, 1.01))
+    with pytest.raises(BadReply, match="its own request"):
+        fresh.believe(block(1020, 3), asked(3, 1.02))
+    assert fresh.believe(block(1030, 4), asked(4, 1.03)).sequence == 1030

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +77,29 @@ def test_compare_reports_against_a_table(tmp_path: Path) -> None:
     assert told["rows_count"] == 4
     assert told["solved_all"]["expansion"]["worst"] < 1e-6
     assert told["solved_all"]["stiffness"]["worst"] < 1e-6
+
+
+def test_compare_names_the_rows_without_a_cell_and_why(tmp_path: Path) -> None:
+    table = tmp_path / "published.csv"
+    table.write_text(
+        "t_over_l0,theta_rad,expansion_ratio,energy_barrier,stiffness\n0.12,0.05,1.6,20,300\n0.3,0,1.2,1,9\n"
+    )
+    told = json.loads(run("compare", str(table), "--jobs", "1", "--json", home=tmp_path).stdout)
+    assert [(row["row"], row["verdict"]) for row in told["solved_unanswered"]] == [(2, "not bistable")]
+    assert "dE/ds" in told["solved_unanswered"][0]["reason"]
+    assert [row["row"] for row in told["interpolated_unanswered"]] == [2]
+    assert "row 2" in run("compare", str(table), "--jobs", "1", home=tmp_path).stdout
+
+
+def test_show_says_how_many_second_states_are_left_out_of_the_range(tmp_path: Path) -> None:
+    told = json.loads(run("show", "--json", home=tmp_path).stdout)
+    assert told["shallow_count"] == 28
+    assert "28 more" in run("show", home=tmp_path).stdout
+
+
+def test_the_command_loads_no_numpy_before_it_has_asked_for_one_thread() -> None:
+    code = "import sys, fabctl.cli.library; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_a_table_without_its_columns_is_refused(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from fabctl.config.bench import BenchConfig
 from fabctl.config.loader import parse
+from fabctl.config.spec import SpecConfig
 from fabctl.errors import ConfigError
 
 GOOD = """
@@ -54,3 +55,18 @@ def test_an_empty_file_lacks_its_keys() -> None:
 )
 def test_what_would_exhaust_the_reader_is_refused_with_its_place(text: str) -> None:
     assert complaints(text)[0].startswith("lab.yaml:")
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("{mak: cap, radius_mm: wide}", {"target.make: Field required", "target.mak: unknown key"}),
+        ("5", {"target: a mapping of keys was expected, not 5"}),
+    ],
+)
+def test_a_key_of_several_kinds_is_told_by_its_own_names(target: str, said: set[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(f"name: cap\ntarget: {target}\n", SpecConfig, "spec.yaml")
+    texts = {line.removeprefix("spec.yaml:2: ") for line in caught.value.complaints}
+    assert said <= texts
+    assert not [text for text in texts if "MadeTarget" in text or ".str" in text]

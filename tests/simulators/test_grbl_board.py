@@ -7,8 +7,9 @@ import math
 import pytest
 
 from simulators.grbl.board import Board, Point
-from simulators.grbl.gcode import Fault, Parser, parse
+from simulators.grbl.gcode import Fault, parse
 from simulators.grbl.machine import Machine, State, World
+from simulators.grbl.modes import Parser
 from simulators.grbl.settings import Memory
 from simulators.grbl.words import decimals, read_number
 

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from simulators.rig import registers as R
 from simulators.rig.axis import Axis
 from simulators.rig.controller import Controller, Machine
-from simulators.rig.modbus import answer, crc16, rtu_frame, take_rtu
-from simulators.rig.server import Pace
+from simulators.rig.faults import FaultyLine
+from simulators.rig.modbus import Request, answer, crc16, rtu_frame, take_rtu
+from simulators.rig.server import Link, Pace, Server
 from simulators.specimens.analytic import bistable, hertz, linear
 from simulators.specimens.curve import Curves, Specimen
 
@@ -202,3 +203,17 @@ def test_noise_before_a_request_does_not_hide_it(noise: bytes) -> None:
 def test_an_unknown_function_is_refused() -> None:
     assert answer(bytes([7]), Controller(QUIET)) == bytes([0x87, 1])
     assert answer(bytes([3, 1, 0, 0, 1]), Controller(QUIET)) == bytes([0x83, 2])
+
+
+def test_a_request_is_answered_at_the_tick_at_which_it_was_whole_however_late_this_process_wakes() -> None:
+    now_s = [0.0]
+    server = Server(Controller(QUIET), FaultyLine(), Pace(115200, 11, 1e-3), now_s=lambda: now_s[0])
+    served: list[int] = []
+    server.device.tell = lambda kind, _: served.append(server.device.tick_count) if kind == "command" else None
+    body = {name: 0.0 for name, *_ in R.COMMAND} | {"id": 1, "code": R.STOP}
+    words = R.words_of(R.COMMAND, body)
+    pdu = bytes([16, 0, 100, 0, len(words), 2 * len(words)]) + b"".join(w.to_bytes(2, "big") for w in words)
+    server._waiting.append((0.0205, Link(-1, serial=True), Request(0, 1, pdu, 35)))
+    now_s[0] = 0.050
+    server._serve_due()
+    assert served == [20]

@@ -104,6 +104,23 @@ def test_a_pause_stands_and_goes_on_to_the_same_place() -> None:
     assert deepest == pytest.approx(2.0 + 3.0, abs=0.2)  # contact is taken where the trigger is met
 
 
+def test_a_pause_asked_for_while_the_stage_stands_lets_no_motion_begin() -> None:
+    asked: list[int] = []
+
+    def wish(bench: Bench) -> Wish:
+        during_the_tare = bench.runner._action.kind == "tare"
+        if during_the_tare or (asked and len(asked) < 80):
+            asked.append(bench.device.tick_count)
+            return "pause"
+        return "go"
+
+    bench = Bench(linear(0.5), method(3.0, 1.0), wish=wish)
+    bench.device.tell = lambda kind, facts: bench.told.append((kind, {**facts, "tick": bench.device.tick_count}))
+    bench.runner.execute()
+    downwards = [f["tick"] for kind, f in bench.told if kind == "command" and f["code"] == R.MOVE_UNTIL_ABOVE]
+    assert downwards[0] > asked[-1]  # type: ignore[operator]
+
+
 def test_an_overload_stops_and_is_not_drawn_back() -> None:
     plan = method(8.0, 2.0)
     plan = plan.model_copy(update={"limits": plan.limits.model_copy(update={"force_N": 2.0})})
