@@ -1,8 +1,8 @@
 """Figures of the scan comparison, on simulated scans whose truth is known.
 
 `python -m benchmarks scan [--scans 200] [--first-seed 0] [--csv FILE] [--only WORD,…] [--peer]`,
-words: poses, symmetry, scale, bump, sign, speed, memory. The published targets are used where `$FABCTL_SHARED` (or `../shared`) has them.
-`--peer` also runs CloudCompare.
+words: poses, symmetry, scale, bump, sign, speed, memory. The published targets are used where `$FABCTL_SHARED` (or
+`../shared`) has them. `--peer` also runs CloudCompare.
 """
 
 from __future__ import annotations
