@@ -1,13 +1,14 @@
 """Figures of the scan comparison, on simulated scans whose truth is known.
 
-`python -m benchmarks scan [--scans 200] [--only WORD,…] [--peer]`, words: poses, symmetry, scale, bump, sign, speed,
-memory. The published targets are used where `$FABCTL_SHARED` (or `../shared`) has them.
-`--peer` also runs CloudCompare.
+`python -m benchmarks scan [--scans 200] [--first-seed 0] [--csv FILE] [--only WORD,…] [--peer]`,
+words: poses, symmetry, scale, bump, sign, speed, memory. The published targets are used where `$FABCTL_SHARED` (or
+`../shared`) has them. `--peer` also runs CloudCompare.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import shutil
@@ -16,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -99,14 +100,17 @@ def outcome(case: Case, plan: ScanPlan) -> Outcome:
     return Outcome(case.name, plan.seed, found.status, apart, scale, wall, cpu)
 
 
-def pose_figures(known: list[Case], count: int) -> list[Figure]:
-    """Return what became of `count` seeded raw scans of unknown scale."""
+def pose_figures(known: list[Case], count: int, first: int = 0, table: Path | None = None) -> list[Figure]:
+    """Return what became of `count` seeded raw scans of unknown scale; `table` gets a row for each as it ends."""
     found = []
-    for seed in range(count):
+    for seed in range(first, first + count):
         case = known[seed % len(known)]
         noise_frac = 0.001 + 0.002 * ((seed * 7919) % 100) / 100
         one = outcome(case, ScanPlan(seed=seed, unseen_frac=0.3, outliers_frac=0.05, noise_frac=noise_frac))
         found.append(one)
+        if table is not None:
+            with table.open("a", newline="", encoding="utf-8") as stream:
+                csv.writer(stream).writerow(astuple(one))
         print(
             f"{one.case:24} seed {one.seed:3} {one.status:10} error {one.error_frac:8.3%} "
             f"scale {one.scale_error_frac:8.4%} {one.wall_s:5.1f} s wall {one.cpu_s:5.1f} s cpu",
@@ -347,13 +351,15 @@ def measure(words: list[str]) -> list[Figure]:
     """Return every figure, or those asked for."""
     asked = argparse.ArgumentParser(prog="python -m benchmarks scan")
     asked.add_argument("--scans", type=int, default=200)
+    asked.add_argument("--first-seed", type=int, default=0, help="of the raw scans")
+    asked.add_argument("--csv", type=Path, help="append a row for every raw scan: case, seed, status, errors, times")
     asked.add_argument("--only", default="poses,symmetry,scale,bump,sign,speed,memory")
     asked.add_argument("--peer", action="store_true")
     wanted = asked.parse_args(words)
     only = wanted.only.split(",")
     known = cases() if set(only) & {"poses", "symmetry", "scale", "bump", "sign"} else []
     figures: list[Figure] = []
-    figures += pose_figures(known, wanted.scans) if "poses" in only else []
+    figures += pose_figures(known, wanted.scans, wanted.first_seed, wanted.csv) if "poses" in only else []
     figures += symmetry_figures(known) if "symmetry" in only else []
     figures += scale_figures(known) if "scale" in only else []
     figures += bump_figures(known) if "bump" in only else []

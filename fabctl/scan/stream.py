@@ -173,7 +173,8 @@ def _ply_piece(column: dict[str, NDArray[np.generic]], header: PlyHeader) -> Pie
     colours = stacked(("red", "green", "blue"))
     if colours is not None:
         kind = header.kinds[header.names.index("red")]
-        colours = colours * {"f": 255.0, "u2": 1 / 257}.get(kind if kind == "u2" else kind[0], 1.0)
+        full = 65535.0 if kind == "u2" else 1.0 if kind[0] == "f" and colours.max(initial=0.0) <= 1 else 255.0
+        colours = colours * (255.0 / full)
     return Piece(points, _extra(stacked(("nx", "ny", "nz")), colours, len(points)))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fabctl.errors import RefusedError, UsageError
-from fabctl.scan import stream
+from fabctl.scan import cloud, stream
 from fabctl.scan.cloud import read_cloud, read_labelled
 from fabctl.scan.foreign import open3d
 
@@ -99,6 +99,20 @@ def test_a_file_read_in_small_pieces_is_drawn_evenly(monkeypatch: pytest.MonkeyP
     assert np.histogram(found.points[:, 0], bins=4)[0] == pytest.approx(500, abs=90)
     assert found.colours is not None
     assert (found.colours == [0, 0, 128]).all()
+
+
+@pytest.mark.parametrize(("kind", "full"), [("f4", 1.0), ("f4", 255.0), ("u1", 255), ("u2", 65535)])
+def test_colours_of_a_ply_are_brought_to_one_range(tmp_path: Path, kind: str, full: float) -> None:
+    table = np.zeros(900, dtype=[("x", "<f8"), ("y", "<f8"), ("z", "<f8"), *((k, "<" + kind) for k in cloud.RGB)])
+    table["x"], table["y"], table["z"] = POINTS.T
+    table["red"], table["blue"][:450] = full, full
+    word = {"f4": "float", "u1": "uchar", "u2": "ushort"}[kind]
+    lines = ["ply", "format binary_little_endian 1.0", "element vertex 900", *(f"property double {k}" for k in "xyz")]
+    lines += [f"property {word} {k}" for k in cloud.RGB]
+    (tmp_path / "cloud.ply").write_bytes("\n".join([*lines, "end_header\n"]).encode() + table.tobytes())
+    found = read_cloud(tmp_path / "cloud.ply")
+    assert found.colours is not None
+    assert found.colours[[0, 899]].tolist() == [[255, 0, 255], [255, 0, 0]]
 
 
 def test_a_ply_that_ends_too_early_is_refused(tmp_path: Path) -> None:
