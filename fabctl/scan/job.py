@@ -21,11 +21,13 @@ from fabctl.scan.colours import colours_of, span_mm
 from fabctl.scan.deviation import Deviation, Statistics, Uncertainty, bootstrap, deviate, statistics
 from fabctl.scan.judge import Judged
 from fabctl.scan.markers import Scale, scale_from_board
+from fabctl.scan.metric import scale_from_bars, scale_from_shots
 from fabctl.scan.modes import Mode, aligned_by
 from fabctl.scan.refine import Options, refine
 from fabctl.scan.register import FINAL_POINTS, Datums, Registration, Task, register
 from fabctl.scan.symmetry import Symmetries, find_symmetries
 from fabctl.scan.target import Target
+from fabctl.vision.boards import MarkSheet
 
 Floats = NDArray[np.float64]
 ScaleChoice = Literal["free", "known", "markers"]
@@ -45,6 +47,10 @@ class Request:
     unit_mm: float = 1.0  # for a known scale
     markers: Path | None = None  # label,x,y,z in cloud units
     board: Path | None = None  # label,x,y,z in mm
+    bars: Path | None = None  # two points in cloud units and their distance in mm, a line each
+    model: Path | None = None  # folder of a COLMAP text model
+    pictures: Path | None = None  # folder of the pictures it names
+    marks: MarkSheet | None = None  # coded marks in these pictures
     datum_cloud: Path | None = None  # label,x,y,z in cloud units
     datum_target: Path | None = None  # label,x,y,z in mm, in the target's frame
     mode: Mode = "best-fit"
@@ -59,6 +65,8 @@ class Request:
             self.predicted,
             self.markers,
             self.board,
+            self.bars,
+            *([self.model / "cameras.txt", self.model / "images.txt"] if self.model else []),
             self.datum_cloud,
             self.datum_target,
         )
@@ -123,7 +131,7 @@ def compare(request: Request, emit: Emit = silent) -> Comparison:
     registration = register(task)
     registration = _by_mode(request.mode, task, registration)
     made = Comparison(request, target, cloud, cleaned, registration, scale)
-    findings = [*cloud.findings, *registration.findings]
+    findings = [*cloud.findings, *(scale.findings if scale is not None else ()), *registration.findings]
     if registration.status not in ("aligned", "symmetric") or registration.best is None:
         return replace(made, findings=tuple(findings))
     emit(Event("stage", "measuring deviations"))
@@ -144,6 +152,10 @@ def known_scale(request: Request) -> Scale | None:
         return Scale(request.unit_mm, 0.0, 0)
     if request.scale == "free":
         return None
+    if request.bars is not None:
+        return scale_from_bars(request.bars)
+    if request.model is not None and request.pictures is not None and request.marks is not None:
+        return scale_from_shots(request.model, request.pictures, request.marks)
     if request.markers is None or request.board is None:
         raise UsageError("--scale markers needs --markers (from the scan) and --board (as measured, mm)")
     return scale_from_board(read_labelled(request.markers), read_labelled(request.board))
@@ -244,7 +256,8 @@ def result(made: Comparison) -> dict[str, Any]:
     if made.uncertainty is not None:
         body["uncertainty"] = {k: _finite(v) for k, v in asdict(made.uncertainty).items()}
     if made.scale is not None:
-        body["scale"] = asdict(made.scale)
+        body["scale"] = {**asdict(made.scale), "findings": [finding.as_dict() for finding in made.scale.findings]}
+        body["scale"]["sigma_frac"] = _finite(made.scale.sigma_frac)
     if made.predicted is not None:
         body["against_predicted"] = {
             **statistics_facts(made.predicted.statistics),
