@@ -72,8 +72,9 @@ def photograph(page: Picture, condition: Condition, rng: np.random.Generator) ->
 
 
 def no_marker(kind: int, rng: np.random.Generator) -> Picture:
-    """Return a picture of 400 x 300 px without any marker of ours, one of eight kinds."""
-    makers = (_blocks, _chessboard, _text, _slits, _foreign, _mirrored, _noise, _frames)
+    """Return a picture of 400 x 300 px without any marker of ours, one of twelve kinds."""
+    first = (_blocks, _chessboard, _text, _slits, _foreign, _mirrored, _noise, _frames)
+    makers = (*first, _wood, _room, _tilted_board, _mirrored_id)
     picture = makers[kind % len(makers)](rng)
     blurred = cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.3, 1.5)))
     return np.asarray(np.clip(blurred + rng.normal(0, 2, blurred.shape), 0, 255), dtype=np.uint8)
@@ -159,6 +160,61 @@ def _frames(rng: np.random.Generator) -> Picture:
         drawn = np.kron(bits, np.ones((12, 12))) * 185 + 30
         row, column = 25 + 135 * (k // 3), 25 + 125 * (k % 3)
         page[row : row + 12 * n, column : column + 12 * n] = drawn
+    return page
+
+
+def _wood(rng: np.random.Generator) -> Picture:
+    """Return planks: rings of an off-axis trunk, knots, dark joints."""
+    y, x = np.mgrid[0:300, 0:400].astype(np.float64)
+    page = np.zeros((300, 400))
+    for k in range(4):
+        wobble = 12 * np.sin(x / rng.uniform(40, 120) + rng.uniform(0, 6))
+        rings = np.hypot((x - rng.uniform(0, 400)) / 9, y - 75 * k + wobble - rng.uniform(-200, 275))
+        grain = 150 + 45 * np.sin(rings / rng.uniform(1.0, 3.5)) + 10 * rng.standard_normal((300, 400))
+        page[75 * k : 75 * k + 75] = grain[75 * k : 75 * k + 75]
+        page[75 * k : 75 * k + 2] = 40
+    return np.asarray(np.clip(page, 0, 255), dtype=np.uint8)
+
+
+def _room(rng: np.random.Generator) -> Picture:
+    """Return what a photograph of things has: soft light of many scales, and dark and light boxes turned anyhow."""
+    page = np.zeros((300, 400), np.float32)
+    for size in (4, 8, 16, 32, 64):
+        small = rng.standard_normal((size, size)).astype(np.float32)
+        page += cv2.resize(small, (400, 300), interpolation=cv2.INTER_CUBIC) * 40 / math.sqrt(size)
+    page = page - page.min()
+    page *= 200 / float(page.max())
+    for _ in range(int(rng.integers(15, 40))):
+        x, y, w, h = (float(value) for value in rng.uniform([0, 0, 10, 10], [400, 300, 90, 90]))
+        corners = cv2.boxPoints(((x, y), (w, h), float(rng.uniform(0, 90))))
+        width = int(rng.choice([-1, 1, 3, 6]))
+        grey = float(rng.uniform(0, 255))
+        if width < 0:
+            cv2.fillPoly(page, [np.rint(corners).astype(np.int32)], grey)
+        else:
+            cv2.polylines(page, [np.rint(corners).astype(np.int32)], True, grey, width)
+    return np.asarray(np.clip(page, 0, 255), dtype=np.uint8)
+
+
+def _tilted_board(rng: np.random.Generator) -> Picture:
+    """Return a chessboard in perspective, some of its fields lost."""
+    size = int(rng.integers(14, 40))
+    y, x = np.mgrid[0:600, 0:800] // size
+    fields = (x + y) % 2
+    fields[rng.random((600 // size + 1, 800 // size + 1))[y, x] < 0.15] = 1
+    corners = np.array([[0, 0], [800, 0], [800, 600], [0, 600]], np.float32)
+    seen = np.array([[0, 0], [400, 0], [400, 300], [0, 300]]) + rng.uniform(-70, 70, (4, 2))
+    H = cv2.getPerspectiveTransform(corners, seen.astype(np.float32))
+    flat = (fields * 180 + 35).astype(np.uint8)
+    return np.asarray(cv2.warpPerspective(flat, H, (400, 300), borderValue=120), dtype=np.uint8)
+
+
+def _mirrored_id(rng: np.random.Generator) -> Picture:
+    """Return two ids seen in a mirror."""
+    page = np.full((300, 400), 215, np.uint8)
+    for k in range(2):
+        drawn = draw_id(f"S-{int(rng.integers(0, 15000)):04d}")[:, ::-1]
+        page[6 + 146 * k : 6 + 146 * k + 144, 60:324] = cv2.resize(drawn, (264, 144), interpolation=cv2.INTER_AREA)
     return page
 
 

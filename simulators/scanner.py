@@ -117,6 +117,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--other-side", action="store_true", help="scan the specimen popped to the other side")
     made.add_argument("--markers", type=Path, help="also write the table's coded markers, label,x,y,z")
     made.add_argument("--board", type=Path, help="also write the measured board, label,x,y,z in mm")
+    made.add_argument("--shots", type=Path, help="also write the scan's pictures and their COLMAP text model here")
+    made.add_argument("--sheet-mm", type=float, nargs=2, default=(300.0, 200.0), help="of the marks in these pictures")
     made.add_argument("--labels", type=Path, help="also write three pen marks on the specimen, label,x,y,z")
     made.add_argument("--datums", type=Path, help="also write where these marks are on the mesh, in mm")
     return made
@@ -167,6 +169,10 @@ def main(words: list[str]) -> int:
         elif path is not None:
             rows = [",".join([name, *(repr(float(x)) for x in place)]) for name, place in places.items()]
             path.write_text("\n".join(["label,x,y,z", *rows]) + "\n")
+    if asked.shots is not None:
+        from simulators.scanshots import write_shots
+
+        write_shots(asked.shots, cloud, vertices_mm, faces, tuple(asked.sheet_mm), plan.seed)
     if asked.truth is not None:
         write_truth(asked.truth, cloud, plan, mesh)
     print(f"scanner: {len(cloud.points)} points to {asked.out}", file=sys.stderr)

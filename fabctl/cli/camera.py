@@ -186,14 +186,16 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
 
 @command.command("align")
 @click.option("--marks", "marks_name", default="bed", show_default=True, help="Marks at known machine places.")
-@click.option("--offset-mm", type=float, nargs=2, default=(0.0, 0.0), help="Where the marks' own origin lies.")
+@click.option("--offset-mm", type=float, nargs=2, default=None, help="Machine place of the marks' own origin.")
+@click.option("--engraved", metavar="RUN", help="The run of `fabctl cut marks` that engraved them: it knows the place.")
 @click.option("--height-mm", type=float, default=0.0, help="Of the marks over the bed: the sheet's thickness.")
 @image_option
 @bench_option
 @json_option
 def align(
     marks_name: str,
-    offset_mm: tuple[float, float],
+    offset_mm: tuple[float, float] | None,
+    engraved: str | None,
     height_mm: float,
     image: Path | None,
     bench_name: str,
@@ -206,7 +208,10 @@ def align(
     from fabctl.vision.lens import read_lens
     from fabctl.vision.overlay import error_map, write_picture
 
-    sheet = with_offset(load_board(marks_name, lab().root).mark_sheet(), *offset_mm)
+    place = _engraved_at(engraved) if engraved else offset_mm
+    if place is None:
+        say("the marks' own origin is taken for machine 0, 0; --offset-mm or --engraved say otherwise")
+    sheet = with_offset(load_board(marks_name, lab().root).mark_sheet(), *(place or (0.0, 0.0)))
     bench, state = bench_and_state(bench_name)
     glass = read_lens(lens_path(state, bench.camera.calibration if bench.camera else None))
     frame = bed_picture(bench_name, image)
@@ -225,6 +230,21 @@ def align(
     }
     text = f"{len(made.witnesses)} marks, each put by the others to {made.rms_mm:.3f} mm rms, {made.worst_mm:.3f} worst"
     show(data, as_json, [f"{path}: {text}", f"{picture}: the error map"])
+
+
+def _engraved_at(name: str) -> tuple[float, float]:
+    """Return where a run of `fabctl cut marks` laid the marks' origin."""
+    from fabctl.errors import UsageError
+    from fabctl.records.folder import open_run, status_of
+
+    path = lab().runs / name
+    if not path.is_dir():
+        raise UsageError(f"{path}: no such run; `fabctl run list` names them")
+    run = open_run(path)
+    if run.manifest().get("kind") != "marks" or status_of(run) != "done":
+        raise UsageError(f"{name} is no finished run of `fabctl cut marks`")
+    (_, _, x), (_, _, y) = run.manifest()["config"]["placement"]
+    return float(x), float(y)
 
 
 @command.command("check")

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.cut_camera import marks_command
 from fabctl.cli.cut_inspect import inspect_command
 
 
@@ -17,6 +18,7 @@ def command() -> None:
 
 
 command.add_command(inspect_command)
+command.add_command(marks_command)
 
 
 @command.command("run")
@@ -30,6 +32,9 @@ command.add_command(inspect_command)
     show_default=True,
     help="Where the sheet's corner is: in the corner of the travel, where the head is, or as the camera sees it.",
 )
+@click.option("--marks", default="registration", show_default=True, help="With --origin camera: the sheet's marks.")
+@click.option("--at-mm", type=float, nargs=2, default=(0.0, 0.0), help="Where on that sheet the design's corner lies.")
+@click.option("--image", type=click.Path(dir_okay=False, path_type=Path), help="A picture of the bed as it is now.")
 @click.option("--camera-file", type=click.Path(dir_okay=False, path_type=Path), help="Sheet to machine map, JSON.")
 @click.option("--frame", is_flag=True, help="Go once around the job first, and ask whether it fits.")
 @click.option("--frame-power", type=click.FloatRange(0, 0.05), default=0.0, help="Beam while framing, at most 5 %.")
@@ -44,6 +49,9 @@ def run(
     material: str | None,
     sheet: int | None,
     origin: str,
+    marks: str,
+    at_mm: tuple[float, float],
+    image: Path | None,
     camera_file: Path | None,
     frame: bool,
     frame_power: float,
@@ -55,19 +63,24 @@ def run(
     as_json: bool,
 ) -> None:
     """Cut the design in folder DESIGN: plan, check, one question, then cut; a run record either way."""
+    from dataclasses import replace
+
     from fabctl.bench import open_bench
+    from fabctl.cli.cut_camera import eye_of
     from fabctl.config.bench import load_bench
     from fabctl.config.material import load_material
-    from fabctl.cut.compose import composer, open_design, sheet_of
+    from fabctl.cut.compose import SPOT_MM, composer, open_design, sheet_of
     from fabctl.cut.job import CutOrder, Desk, cut
     from fabctl.cut.keyboard import HELP, keyboard
 
     home = lab()
     bundle, spec = open_design(design)
     chosen = load_material(material or spec.material, home.root)
+    config = load_bench(bench_name, home.root)
+    spot_mm = config.laser.spot_mm if config.laser is not None else SPOT_MM
     order = CutOrder(
         design=design,
-        compose=composer(bundle, spec, chosen, sheet),
+        compose=composer(bundle, spec, chosen, sheet, spot_mm),
         material=chosen,
         sheet=sheet_of(spec, home.root),
         origin=origin,  # type: ignore[arg-type]  # click.Choice has checked it
@@ -76,8 +89,9 @@ def run(
         frame_power_frac=frame_power,
         home=not no_home,
     )
-    config = load_bench(bench_name, home.root)
     with open_bench(home, config, f"cut {design.name}") as bench, keyboard() as keys:
+        if origin == "camera" and resume_run is None:
+            order = replace(order, eye=eye_of(bench, marks, at_mm, chosen.thickness_mm, camera_file, image))
         desk = Desk(lambda question: confirm(question, yes), progress(), keys)
         if not dry_run:
             say(HELP)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from fabctl.events import Event
     from fabctl.records.folder import RunFolder
     from fabctl.scan.job import Request
+    from fabctl.vision.boards import MarkSheet
     from fabctl.workspace import Specimen, Workspace
 
 FILE = click.Path(path_type=Path, dir_okay=False)
@@ -44,6 +45,12 @@ def command() -> None:
     help="Markers as scanned: label,x,y,z in cloud units; without it they are looked for in the cloud's colours.",
 )
 @click.option("--board", type=FILE, help="The board as measured: label,x,y,z in mm.")
+@click.option("--bars", type=FILE, help="Scale bars, x1,y1,z1,x2,y2,z2,length_mm: pairs of points in cloud units.")
+@click.option(
+    "--model", type=click.Path(path_type=Path, file_okay=False), help="The scan's COLMAP text model (folder)."
+)
+@click.option("--pictures", type=click.Path(path_type=Path, file_okay=False), help="Its pictures  [MODEL/images].")
+@click.option("--marks", default="scale", show_default=True, help="The board whose coded marks the pictures show.")
 @click.option("--datum", type=FILE, help="Three or more points as scanned: label,x,y,z in cloud units.")
 @click.option("--datum-target", type=FILE, help="The same points on the target: label,x,y,z in mm.")
 @click.option("--colours", type=FILE, help="Coloured PLY in the target's frame, e.g. an earlier scan's colours.ply.")
@@ -65,6 +72,10 @@ def run_scan(
     unit_mm: float,
     markers: Path | None,
     board: Path | None,
+    bars: Path | None,
+    model: Path | None,
+    pictures: Path | None,
+    marks: str,
     datum: Path | None,
     datum_target: Path | None,
     colours: Path | None,
@@ -85,12 +96,18 @@ def run_scan(
     mesh = target if specimen is None else specimen.design / "target.ply"
     if mesh is None:
         raise UsageError("name a specimen, or give --target")
+    if scale != "markers" and (bars or model):
+        raise UsageError("--bars and --model belong to --scale markers")
     predicted = None if specimen is None else specimen.design / "deployed.ply"
     options: dict[str, Any] = {
         "scale": scale,
         "unit_mm": unit_mm,
         "markers": markers,
         "board": board,
+        "bars": bars,
+        "model": model,
+        "pictures": pictures or (model / "images" if model else None),
+        "marks": _mark_sheet(here, marks) if model else None,
         "datum_cloud": datum,
         "datum_target": datum_target,
         "colours": colours,
@@ -170,6 +187,12 @@ def compare_scans(first: str, second: str, as_json: bool) -> None:
         f"correlation {found.correlation_ratio:.2f} over {found.common_frac:.0%} of the target",
     ]
     show({"first": first, "second": second, **asdict(found)}, as_json, lines)
+
+
+def _mark_sheet(here: Workspace, name: str) -> MarkSheet:
+    from fabctl.config.boards import load_board
+
+    return load_board(name, here.root).mark_sheet()
 
 
 def _named(here: Workspace, words: tuple[str, ...], target: Path | None) -> tuple[Specimen | None, Path | None]:

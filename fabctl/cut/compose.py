@@ -1,4 +1,8 @@
-"""From a design folder and a material to the program of one cut, with the specimen's id engraved. **W**"""
+"""From a design folder and a material to the program of one cut, with the specimen's id engraved. **W**
+
+The id stands on the tag twice: as text for people, and as a pair of small markers that `fabctl specimen read` finds in
+a photograph.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,18 @@ from pathlib import Path
 from design.bundle import Bundle, open_bundle
 from design.export.gcode import GcodeOptions
 from design.job import JobOptions, compose_job
-from design.pattern.paths import LAYERS, Layer, LayerPreset
+from design.pattern.drawing import Box
+from design.pattern.paths import LAYERS, CutPath, Layer, LayerPreset
 from design.pattern.toolpath import ToolOptions
 from fabctl.config.loader import load
 from fabctl.config.material import MaterialConfig, load_material
 from fabctl.config.spec import SpecConfig
 from fabctl.cut.job import Compose
 from fabctl.cut.preflight import Sheet
+from fabctl.vision.ids import LARGEST, id_paths, id_size_modules, number_of
+
+SPOT_MM = 0.1  # of a laser whose bench file is not at hand
+PITCH_SPOTS = 1.5  # between strokes that fill an engraved area: charred rubber is wider than the spot
 
 
 def open_design(path: Path) -> tuple[Bundle, SpecConfig]:
@@ -28,10 +37,12 @@ def sheet_of(spec: SpecConfig, home: Path) -> Sheet:
     return Sheet(material.name, material.thickness_mm)
 
 
-def composer(bundle: Bundle, spec: SpecConfig, material: MaterialConfig, sheet: int | None = None) -> Compose:
+def composer(
+    bundle: Bundle, spec: SpecConfig, material: MaterialConfig, sheet: int | None = None, spot_mm: float = SPOT_MM
+) -> Compose:
     """Return the function that makes the program for a specimen's id and a board's full power.
 
-    `sheet`, from 1, is one of those that a design larger than the bed is split over.
+    `sheet`, from 1, is one of those that a design larger than the bed is split over; `spot_mm` is the beam's spot.
     """
     tool = spec.tool.model_dump(exclude={"kerf_mm", "spread_mm"})
     kerf_mm = spec.tool.kerf_mm or (material.laser.kerf_mm if material.laser is not None else 0.1)
@@ -45,9 +56,24 @@ def composer(bundle: Bundle, spec: SpecConfig, material: MaterialConfig, sheet: 
             spread_mm=spec.tool.spread_mm,
         )
         id_text = specimen if drawing.id_anchor is not None else ""
-        return compose_job(drawing, presets, options, id_text).lines
+        code = code_strokes(specimen, drawing.code_box, spot_mm) if id_text and drawing.code_box else []
+        return compose_job(drawing, presets, options, id_text, code).lines
 
     return compose
+
+
+def code_strokes(specimen: str, box: Box, spot_mm: float) -> list[CutPath]:
+    """Return the strokes of the id's two markers, as large as `box` allows and in its middle.
+
+    None for an id beyond the last that two markers can carry; its text is engraved all the same.
+    """
+    if number_of(specimen) > LARGEST:
+        return []
+    across, up = id_size_modules()
+    module_mm = min(box.width_mm / across, box.height_mm / up)
+    x_mm = box.x_mm + (box.width_mm - across * module_mm) / 2
+    y_mm = box.y_mm + (box.height_mm - up * module_mm) / 2
+    return id_paths(specimen, module_mm, x_mm, y_mm, pitch_mm=PITCH_SPOTS * spot_mm, spot_mm=spot_mm)
 
 
 def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:

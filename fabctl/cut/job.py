@@ -10,10 +10,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol
 
 from design.findings import Finding, errors
 from drivers.clock import WallClock
@@ -25,7 +25,7 @@ from drivers.grbl.settings import Identity
 from drivers.transport import open_transport
 from drivers.transport.tap import Tap
 from fabctl.bench import Bench
-from fabctl.config.bench import LaserConfig
+from fabctl.config.bench import BenchConfig, LaserConfig
 from fabctl.config.material import MaterialConfig
 from fabctl.cut.execute import CutWatch, check_on_board, minutes, no_keys, run_plan
 from fabctl.cut.place import Affine, Origin, placement
@@ -46,9 +46,31 @@ Compose = Callable[[str, float], tuple[str, ...]]
 """From the specimen's id and the board's full power ($30) to G-code lines in sheet coordinates."""
 
 
+class Eye(Protocol):
+    """What a job asks of the camera over the bed (`fabctl.cut.by_camera`)."""
+
+    def place(self) -> Affine:
+        """Return the map from the job's coordinates to the machine's; raise `RefusedError` where none is found."""
+
+    def against(self, plan: CutPlan) -> list[Finding]:
+        """Return what speaks against the plan on the sheet that is seen."""
+
+    def show(self, plan: CutPlan) -> str:
+        """Write the picture of the job on the bed; return what to tell the operator."""
+
+    def look_again(self) -> None:
+        """Raise `RefusedError` where the sheet has moved since."""
+
+    def record(self, run: RunFolder, plan: CutPlan) -> None:
+        """Keep what was seen with the run."""
+
+    def facts(self) -> dict[str, Any]:
+        """Return what was seen as plain JSON."""
+
+
 @dataclass(frozen=True, slots=True)
 class CutOrder:
-    """What is to be cut, how, and where."""
+    """What is to be cut, how, and where; `kind` other than "cut" (marks, a coupon) makes no specimen."""
 
     design: Path
     compose: Compose
@@ -60,6 +82,8 @@ class CutOrder:
     frame_power_frac: float = 0.0
     home: bool = True
     check: bool = True
+    eye: Eye | None = None
+    kind: str = "cut"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +117,14 @@ def laser_on(bench: Bench, log: WireLog | None = None) -> Iterator[Laser]:
 
 def laser_config(bench: Bench) -> LaserConfig:
     """Return the bench's laser section; raise `UsageError` where it has none."""
-    if bench.config.laser is None:
-        raise UsageError(f"bench {bench.config.name} has no laser; add one to its file")
-    return bench.config.laser
+    return laser_config_of(bench.config)
+
+
+def laser_config_of(config: BenchConfig) -> LaserConfig:
+    """Return the laser section of a bench file; raise `UsageError` where it has none."""
+    if config.laser is None:
+        raise UsageError(f"bench {config.name} has no laser; add one to its file")
+    return config.laser
 
 
 def cut(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, dry_run: bool = False) -> CutDone:
@@ -114,7 +143,8 @@ def cut(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, dry_run: bool
                 if order.check and laser.report().state == "Idle":
                     check_on_board(laser, plan.lines)
                 return CutDone(plan, None, None, summary(plan, identity_of(laser)))
-            if not desk.ask(question(plan, order, laser_config(bench), homes(laser, bench, order))):
+            screen = question(plan, order, laser_config(bench), homes(laser, bench, order))
+            if not desk.ask(screen):
                 raise Stopped("not cut: the operator said no")
             return _cut_now(lab, bench, order, desk, laser, log)
     finally:
@@ -143,11 +173,24 @@ def _plan(laser: Laser, bench: Bench, order: CutOrder, specimen: str) -> CutPlan
     affine = _affine(order, config, identity, report)
     lines = order.compose(specimen, identity.setting(30) or 1000.0)
     known = will_home or (identity.is_on(22) and report.state == "Idle")
-    return plan_cut(lines, affine, identity, report, config, order.material, order.sheet, known)
+    plan = plan_cut(lines, affine, identity, report, config, order.material, order.sheet, known)
+    if order.eye is None:
+        return plan
+    return replace(plan, findings=(*plan.findings, *_unhomed(known), *order.eye.against(plan)))
+
+
+def _unhomed(known: bool) -> list[Finding]:
+    """Return why a camera is of no use: it measures machine coordinates, which only homing makes mean anything."""
+    if known:
+        return []
+    text = "the machine is not homed, so what the camera measures is no place on it"
+    return [Finding("CUT-CAMERA-UNHOMED", text, hint="fabctl laser home; a machine without homing cuts from here")]
 
 
 def _affine(order: CutOrder, config: LaserConfig, identity: Identity, report: Report) -> Affine:
     head = report.machine_mm
+    if order.eye is not None:
+        return order.eye.place()
     if order.origin == "home" and not identity.is_on(22):
         # Without homing, zero is where the operator says it is: the work origin of the board.
         dx, dy, _ = identity.work_offset_mm()
@@ -171,12 +214,14 @@ def question(plan: CutPlan, order: CutOrder, config: LaserConfig, will_home: boo
     preset = order.material.laser
     bounds = plan.bounds_mm() or (0.0, 0.0, 0.0, 0.0)
     focus = f", focus at {preset.focus_height_mm:g} mm" if preset is not None and preset.focus_height_mm else ""
+    seen = f"  {order.eye.show(plan)}\n" if order.eye is not None else ""
     first = "homes the machine, then cuts" if will_home else "cuts from the zero you have set"
     return (
         f"{order.design}\n"
         f"  {order.material.name}, {order.material.thickness_mm:g} mm: on the bed, flat, clamped{focus}?\n"
         f"  machine X {bounds[0]:.1f} to {bounds[2]:.1f}, Y {bounds[1]:.1f} to {bounds[3]:.1f} mm; "
         f"{plan.burnt_mm() / 1000:.2f} m burnt, {len(plan.lines)} lines, {minutes(plan.times.total_s)}\n"
+        f"{seen}"
         f"  {first}{', frames the job first' if order.frame else ''}; the board holds at most "
         f"{config.max_run_on_s:g} s of work\n"
         "  exhaust on, lid shut, glasses on, you stay beside it with the stop within reach. Start?"
@@ -198,14 +243,16 @@ def summary(plan: CutPlan, identity: Identity) -> dict[str, Any]:
 
 
 def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: Laser, log: WireLog) -> CutDone:
-    specimen = lab.new_specimen(order.design)
-    plan = _plan(laser, bench, order, specimen.name)
+    if order.eye is not None:
+        order.eye.look_again()
+    specimen = lab.new_specimen(order.design) if order.kind == "cut" else None
+    plan = _plan(laser, bench, order, specimen.name if specimen is not None else SAMPLE_ID)
     _refuse(plan.findings)
     run = start_run(
         lab.runs,
-        "cut",
-        specimen=specimen.name,
-        inputs=design_files(specimen.design),
+        order.kind,
+        specimen=specimen.name if specimen is not None else None,
+        inputs=design_files(specimen.design if specimen is not None else order.design),
         config={
             "bench": bench.config.model_dump(mode="json"),
             "material": order.material.model_dump(mode="json"),
@@ -213,20 +260,24 @@ def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: L
             "placement": plan.affine.rows(),
             "work_offset_mm": list(plan.work_offset_mm),
             "plan": summary(plan, identity_of(laser)),
+            **({"registration": order.eye.facts()} if order.eye is not None else {}),
         },
     )
+    if order.eye is not None:
+        order.eye.record(run, plan)
     with recorded(run, laser, log, desk, plan) as tell:
         if homes(laser, bench, order):
             tell(Event("stage", "homing"))
             laser.home()
         result = execute(laser, plan, order, laser_config(bench), Desk(desk.ask, tell, desk.keys), run)
-    bench.lay(specimen.design)
+    if specimen is not None:
+        bench.lay(specimen.design)
     return CutDone(plan, specimen, run, result)
 
 
 def design_files(design: Path) -> list[Path]:
-    """Return the files of a design folder, for the manifest."""
-    return sorted(path for path in design.iterdir() if path.is_file())
+    """Return the files of a design folder (or the one file that says what is cut), for the manifest."""
+    return [design] if design.is_file() else sorted(path for path in design.iterdir() if path.is_file())
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from fabctl.scan.decide import Datums
 from fabctl.scan.deviation import Deviation, Statistics, Uncertainty, bootstrap, deviate, statistics
 from fabctl.scan.judge import Judged
 from fabctl.scan.markers import Scale, scale_from_board
+from fabctl.scan.metric import scale_from_bars, scale_from_shots
 from fabctl.scan.modes import Mode, aligned_by
 from fabctl.scan.paint import Paint, paint_of, read_paint
 from fabctl.scan.painted import marks_on_table
@@ -29,6 +30,7 @@ from fabctl.scan.refine import Options, refine
 from fabctl.scan.register import FINAL_POINTS, Registration, Task, register
 from fabctl.scan.symmetry import Symmetries, find_symmetries
 from fabctl.scan.target import Target
+from fabctl.vision.boards import MarkSheet
 
 Floats = NDArray[np.float64]
 ScaleChoice = Literal["free", "known", "markers"]
@@ -49,6 +51,10 @@ class Request:
     unit_mm: float = 1.0  # for a known scale
     markers: Path | None = None  # label,x,y,z in cloud units
     board: Path | None = None  # label,x,y,z in mm
+    bars: Path | None = None  # two points in cloud units and their distance in mm, a line each
+    model: Path | None = None  # folder of a COLMAP text model
+    pictures: Path | None = None  # folder of the pictures it names
+    marks: MarkSheet | None = None  # coded marks in these pictures
     datum_cloud: Path | None = None  # label,x,y,z in cloud units
     datum_target: Path | None = None  # label,x,y,z in mm, in the target's frame
     colours: Path | None = None  # coloured PLY in the target's frame; without it the target's own colours, if any
@@ -64,6 +70,8 @@ class Request:
             self.predicted,
             self.markers,
             self.board,
+            self.bars,
+            *([self.model / "cameras.txt", self.model / "images.txt"] if self.model else []),
             self.datum_cloud,
             self.datum_target,
             self.colours,
@@ -139,7 +147,7 @@ def compare(request: Request, emit: Emit = silent) -> Comparison:
     registration = register(task)
     registration = _by_mode(request.mode, task, registration)
     made = Comparison(request, target, cloud, cleaned, registration, scale)
-    findings = [*cloud.findings, *registration.findings]
+    findings = [*cloud.findings, *(scale.findings if scale is not None else ()), *registration.findings]
     if registration.status not in ("aligned", "symmetric") or registration.best is None:
         return replace(made, findings=tuple(findings))
     emit(Event("stage", "measuring deviations"))
@@ -163,6 +171,10 @@ def known_scale(request: Request, cloud: Cloud, cleaned: Cleaned) -> Scale | Non
         return Scale(request.unit_mm, 0.0, 0)
     if request.scale == "free":
         return None
+    if request.bars is not None:
+        return scale_from_bars(request.bars)
+    if request.model is not None and request.pictures is not None and request.marks is not None:
+        return scale_from_shots(request.model, request.pictures, request.marks)
     if request.board is None:
         raise UsageError("--scale markers needs --board (as measured, mm), and --markers or a coloured cloud")
     if request.markers is not None:
@@ -277,7 +289,8 @@ def result(made: Comparison) -> dict[str, Any]:
     if made.uncertainty is not None:
         body["uncertainty"] = {k: _finite(v) for k, v in asdict(made.uncertainty).items()}
     if made.scale is not None:
-        body["scale"] = asdict(made.scale)
+        body["scale"] = {**asdict(made.scale), "findings": [finding.as_dict() for finding in made.scale.findings]}
+        body["scale"]["sigma_frac"] = _finite(made.scale.sigma_frac)
     if made.predicted is not None:
         body["against_predicted"] = {
             **statistics_facts(made.predicted.statistics),

@@ -20,11 +20,17 @@ MISFIT_LIMIT_FRAC = 0.005  # of the board's size; a marker farther off than this
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Millimetres per cloud unit, with its standard deviation as a fraction of it."""
+    """Millimetres per cloud unit, with its standard deviation as a fraction of it.
+
+    `to_board` is the first pose, four rows of a matrix from cloud units to the board's millimetres, z up; None where
+    the marks do not give one.
+    """
 
     unit_mm: float
     sigma_frac: float
     markers_count: int
+    to_board: tuple[tuple[float, ...], ...] | None = None
+    findings: tuple[Finding, ...] = ()
 
 
 def scale_from_board(seen: Mapping[str, Floats], board_mm: Mapping[str, Floats]) -> Scale:

@@ -43,13 +43,16 @@ class EngravedId:
 
 
 def number_of(specimen: str) -> int:
-    """Return the number in `S-0042`; raise `ValueError` where it is no id, or too large for the code."""
+    """Return the number in `S-0042`; raise `ValueError` where it is no id."""
     found = NAME.fullmatch(specimen)
     if found is None:
         raise ValueError(f"{specimen!r} is not a specimen id such as S-0042")
-    if int(found[1]) > LARGEST:
-        raise ValueError(f"{specimen} is beyond S-{LARGEST}, the last id that two markers can carry; engrave a QR code")
     return int(found[1])
+
+
+def id_size_modules() -> tuple[int, int]:
+    """Return width and height of a pair's black, in modules."""
+    return 2 * MODULES + GAP_MODULES, MODULES
 
 
 def specimen_of(left: int, right: int) -> str | None:
@@ -62,6 +65,8 @@ def specimen_of(left: int, right: int) -> str | None:
 def id_sheet(specimen: str, module_mm: float, x_mm: float = 0.0, y_mm: float = 0.0) -> MarkSheet:
     """Return the two markers of an id; (`x_mm`, `y_mm`) is the lower left corner of the black."""
     number = number_of(specimen)
+    if number > LARGEST:
+        raise ValueError(f"{specimen} is beyond S-{LARGEST}, the last id that two markers can carry; engrave a QR code")
     side = MODULES * module_mm
     left, right = number // BASE, BASE + number % BASE
     step = (MODULES + GAP_MODULES) * module_mm

@@ -12,7 +12,7 @@ from design.pattern.paths import CutPath
 from fabctl.vision.align import Alignment
 from fabctl.vision.inspect import Inspection
 from fabctl.vision.profile import ToPixels
-from fabctl.vision.register import apply
+from fabctl.vision.register import Registration, apply
 from fabctl.vision.template import F64
 
 Picture = NDArray[np.uint8]
@@ -56,6 +56,28 @@ def job_on_bed(
     for path in paths:
         points = apply(affine, dense(path.points_mm, path.closed))
         polyline(picture, alignment.to_pixels(points, height_mm), COLOURS[path.layer])
+    return picture
+
+
+def program_on_bed(
+    image: Picture, moves_mm: Sequence[tuple[F64, F64, float]], sheet: Registration, alignment: Alignment
+) -> Picture:
+    """Return the bed picture in colour with the sheet's border and every burning move (start, end, power) of a program.
+
+    Moves are in machine millimetres; those at half of the strongest power or more are drawn as cuts, others as
+    engraving.
+    """
+    import cv2
+
+    picture: Picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    w, h = sheet.size_mm
+    border = apply(sheet.affine, dense(np.array([[0, 0], [w, 0], [w, h], [0, h]], dtype=np.float64), True))
+    polyline(picture, alignment.to_pixels(border, sheet.height_mm), COLOURS["outline"], width_px=2)
+    strongest = max((power for _, _, power in moves_mm), default=0.0)
+    ends = np.array([end for start, stop, _ in moves_mm for end in (start, stop)]).reshape(-1, 2)
+    pixels = alignment.to_pixels(ends, sheet.height_mm).reshape(-1, 2, 2) if len(ends) else np.empty((0, 2, 2))
+    for line, (_, _, power) in zip(pixels, moves_mm, strict=True):
+        polyline(picture, line, COLOURS["slit" if power >= strongest / 2 else "engrave"])
     return picture
 
 

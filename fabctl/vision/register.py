@@ -70,6 +70,13 @@ def apply(affine: F64, points_mm: F64) -> F64:
     return np.asarray(points_mm @ affine[:, :2].T + affine[:, 2], dtype=np.float64)
 
 
+def moved_mm(before: Registration, now: Registration) -> float:
+    """Return how far a corner of the sheet lies from where it lay, at most."""
+    w, h = before.size_mm
+    corners = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
+    return float(np.linalg.norm(apply(before.affine, corners) - apply(now.affine, corners), axis=1).max())
+
+
 def fit_affine(source_mm: F64, target_mm: F64) -> F64:
     """Return the affine map (2, 3) that takes points (n, 2) to `target_mm` with the least squares."""
     rows = np.column_stack([source_mm, np.ones(len(source_mm))])
