@@ -18,9 +18,9 @@ from design.findings import Finding, errors
 from drivers.clock import WallClock
 from drivers.errors import DeviceError
 from drivers.grbl.laser import Laser
-from drivers.grbl.messages import Report
+from drivers.grbl.messages import Info, Report
 from drivers.grbl.run import StoppedByOperator, Wish
-from drivers.grbl.settings import Identity
+from drivers.grbl.settings import Identity, identify
 from drivers.transport import open_transport
 from drivers.transport.tap import Tap
 from fabctl.bench import Bench
@@ -378,9 +378,6 @@ def execute(
 
 def recheck_offset(laser: Laser, plan: CutPlan) -> None:
     """Check mode restarts the board: the work offset must still be the one the plan was made for."""
-    from drivers.grbl.messages import Info
-    from drivers.grbl.settings import identify
-
     answers = [m for m in (*laser.ask("$#"), *laser.ask("$G")) if isinstance(m, Info)]
     laser.end()
     now = identify(answers, None).work_offset_mm()
