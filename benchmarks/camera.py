@@ -30,7 +30,7 @@ from fabctl.vision.kerf import measure as measure_kerf
 from fabctl.vision.lens import Lens, calibrate, find_board
 from fabctl.vision.markers import find_markers
 from fabctl.vision.register import apply, register
-from fabctl.vision.scale import ShotPose, marks_in_pictures, scale_by_marks
+from fabctl.vision.scale import ShotPose, scale_by_shots
 from simulators.camera import scene as scenes
 from simulators.camera.burn import kerf_mm, to_machine
 from simulators.camera.optics import View, compose, develop, flat_layer, view_of
@@ -221,7 +221,7 @@ def _aside(path: CutPath) -> F64:
 def _scale(scans: int) -> list[Figure]:
     errors, covered = [], []
     for seed in range(scans):
-        made = scale_by_marks(marks_in_pictures(_shots(seed)), boards.scale_marks((300.0, 200.0)))
+        made = scale_by_shots(_shots(seed), boards.scale_marks((300.0, 200.0)))
         errors.append(made.mm_per_unit_ratio / UNIT_MM - 1)
         covered.append(abs(errors[-1]) <= made.uncertainty_ratio)
     note = "<= 0.02 % (12 pictures, poses as a bundle adjustment leaves them)"

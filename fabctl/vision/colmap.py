@@ -10,7 +10,7 @@ from drivers.camera import read_picture
 from fabctl.errors import UsageError
 from fabctl.vision.boards import MarkSheet
 from fabctl.vision.markers import find_markers
-from fabctl.vision.scale import ScanScale, ShotPose, marks_in_pictures, scale_by_marks
+from fabctl.vision.scale import ScanScale, ShotPose, scale_by_shots
 from fabctl.vision.template import F64
 
 # model -> where fx, fy, cx, cy and k1, k2, p1, p2 stand among its parameters
@@ -56,7 +56,7 @@ def scale_from_pictures(model: Path, pictures: Path, sheet: MarkSheet) -> ScanSc
     for name, pose in read_model(model).items():
         markers = find_markers(read_picture(pictures / name).image, sheet.family)
         shots.append((pose, {m.id: m.centre_px + 0.5 for m in markers if m.id in known}))
-    return scale_by_marks(marks_in_pictures(shots), sheet)
+    return scale_by_shots(shots, sheet)
 
 
 def _rows(path: Path, every_second: bool = False) -> list[tuple[int, list[str]]]:

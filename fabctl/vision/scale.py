@@ -3,6 +3,10 @@
 A photogrammetry cloud has a scale and a frame of its own. Coded marks seen in its pictures are placed in that frame by
 the pictures' poses (COLMAP's text model, which other programs also export), or are given as points on the cloud; their
 true places then fix scale, turn and shift. Bars, pairs of points with a known distance, fix the scale alone.
+
+Three errors make the scale's uncertainty: of each mark's or bar's own place, by how badly they fit; of each picture's
+pose, which moves all its marks together and so leaves no misfit, by leaving each picture out in turn (Efron and Stein
+1981); and of the mark finder, alike in all pictures. An error of the board's own measured size is in none of them.
 """
 
 from __future__ import annotations
@@ -10,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +27,8 @@ LEAST_MARKS_COUNT = 3
 MOST_SPREAD_RATIO = 0.005  # between the scales that single distances give
 MOST_ERROR_RATIO = 0.01  # of the marks' extent: a mark placed worse is not that mark
 LEAST_RAY_ANGLE_RAD = math.radians(3)  # rays flatter to each other than this place nothing
+FINDER_PX = 0.005  # standard; what moves marks outwards or inwards in every picture, as lens curvature within a mark
+COVERAGE_FRAC = 0.9545  # what k = 2 means for many values; Student's factor where they are few
 MOST_RAY_RATIO = 0.01  # distance of a ray from its point, over the distance to the camera
 
 
@@ -72,7 +78,9 @@ def scale_by_bars(bars: Sequence[Bar]) -> ScanScale:
     if errors(found):
         raise RefusedError("the bars contradict each other", found)
     matrix = np.diag([mm_per_unit] * 3 + [1.0])
-    return ScanScale(mm_per_unit, _doubt(spread, len(bars)), matrix, spread, len(bars), None, tuple(found))
+    rest_mm = mm_per_unit * lengths - told
+    doubt = _doubt(rest_mm, len(bars) - 1, float(np.linalg.norm(told)))
+    return ScanScale(mm_per_unit, doubt, matrix, spread, len(bars), None, tuple(found))
 
 
 def scale_by_marks(places: Mapping[int, F64], sheet: MarkSheet, plane_mm: float = 0.0) -> ScanScale:
@@ -81,12 +89,17 @@ def scale_by_marks(places: Mapping[int, F64], sheet: MarkSheet, plane_mm: float 
     The result's frame is the sheet's (z up, marks at `plane_mm`). A mark that contradicts the others is left out with a
     warning where five or more are known; otherwise contradiction is refused.
     """
+    return _agreed(places, sheet, plane_mm)[0]
+
+
+def _agreed(places: Mapping[int, F64], sheet: MarkSheet, plane_mm: float) -> tuple[ScanScale, list[int]]:
+    """Return the scale by the marks that agree, and their ids."""
     ids = sorted(k for k in places if sheet.mark(k) is not None)
     dropped: list[Finding] = []
     while True:
         made, worst = _by_marks({k: places[k] for k in ids}, sheet, plane_mm, dropped)
         if not errors(made.findings):
-            return made
+            return made, ids
         if len(ids) <= LEAST_MARKS_COUNT + 1:
             raise RefusedError("the marks give no scale", made.findings)
         ids.remove(worst)
@@ -117,8 +130,11 @@ def _by_marks(
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = mm_per_unit * R, t
     rms = float(np.sqrt(np.mean(rest_mm**2)))
-    # Distances between n marks are not independent: they carry the errors of n points.
-    return ScanScale(mm_per_unit, _doubt(spread, len(ids)), matrix, spread, len(ids), rms, tuple(found)), ids[worst]
+    # All marks lie in one plane, so to first order only what is off within it bears on the scale: 2 n coordinates, of
+    # which shift, turn and scale take four.
+    flat_mm = (mm_per_unit * seen @ R.T + t - told)[:, :2].ravel()
+    doubt = _doubt(flat_mm, len(flat_mm) - 4, float(np.linalg.norm(told - told.mean(axis=0))))
+    return ScanScale(mm_per_unit, doubt, matrix, spread, len(ids), rms, tuple(found)), ids[worst]
 
 
 def similarity(source: F64, target: F64) -> tuple[float, F64, F64]:
@@ -136,8 +152,18 @@ def _spread(ratios: F64, weight_mm: F64) -> float:
     return float(np.sqrt(np.average((ratios - 1) ** 2, weights=weight_mm**2)))
 
 
-def _doubt(spread_ratio: float, count: int) -> float:
-    return 2 * spread_ratio / math.sqrt(max(count - 1, 1)) if count > 1 else math.inf
+def _doubt(rest_mm: F64, freedom_count: int, arm_mm: float) -> float:
+    """Return the expanded relative uncertainty of a scale from its misfits; `arm_mm` is the norm of all lever arms."""
+    if freedom_count < 1:
+        return math.inf
+    return _cover(freedom_count) * float(np.sqrt(rest_mm @ rest_mm / freedom_count)) / arm_mm
+
+
+def _cover(freedom_count: int) -> float:
+    """Return the coverage factor of a standard deviation that so many free values tell."""
+    from scipy.stats import t
+
+    return float(t.ppf((1 + COVERAGE_FRAC) / 2, freedom_count))
 
 
 def _spread_findings(spread: float, what: str, names: Sequence[str], ratios: F64) -> list[Finding]:
@@ -202,3 +228,37 @@ def marks_in_pictures(shots: Sequence[tuple[ShotPose, Mapping[int, F64]]]) -> di
         if place is not None:
             found[k] = place
     return found
+
+
+Shots = Sequence[tuple[ShotPose, Mapping[int, F64]]]
+
+
+def scale_by_shots(shots: Shots, sheet: MarkSheet, plane_mm: float = 0.0) -> ScanScale:
+    """Return scale and first pose from where pictures see the marks, with what poses and mark finder add in doubt."""
+    made, ids = _agreed(marks_in_pictures(shots), sheet, plane_mm)
+    told = {k: mark.centre_mm for k in ids if (mark := sheet.mark(k)) is not None}
+    doubt = math.hypot(made.uncertainty_ratio, _pose_doubt(shots, told), 2 * _finder_doubt(shots, told))
+    return replace(made, uncertainty_ratio=doubt)
+
+
+def _pose_doubt(shots: Shots, told: Mapping[int, F64]) -> float:
+    """Return the expanded relative uncertainty by the pictures: how the scale changes as each is left out."""
+    useful = [shot for shot in shots if any(k in told for k in shot[1])]
+    n = len(useful)
+    scales = []
+    for left_out in range(n):
+        places = marks_in_pictures([shot for k, shot in enumerate(useful) if k != left_out])
+        ids = sorted(places.keys() & told.keys())
+        if len(ids) < LEAST_MARKS_COUNT:
+            return math.inf  # without this picture there is no scale, so nothing checks it
+        target = np.array([[*told[k], 0.0] for k in ids])
+        scales.append(similarity(np.array([places[k] for k in ids]), target)[0])
+    spread = float(np.sqrt((n - 1) * np.var(scales)))
+    return _cover(n - 1) * spread / float(np.mean(scales))
+
+
+def _finder_doubt(shots: Shots, told: Mapping[int, F64]) -> float:
+    """Return the standard relative uncertainty by the mark finder: its error over the marks' distances in a picture."""
+    groups = [np.array([seen[k] for k in seen if k in told]) for _, seen in shots]
+    arms = [float(np.sqrt(np.mean(np.sum((g - g.mean(axis=0)) ** 2, axis=1)))) for g in groups if len(g) > 1]
+    return FINDER_PX / float(np.median(arms)) if arms else math.inf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,16 @@ from scipy.spatial.transform import Rotation
 from fabctl.errors import RefusedError, UsageError
 from fabctl.vision.boards import scale_marks
 from fabctl.vision.colmap import read_model
-from fabctl.vision.scale import Bar, ShotPose, marks_in_pictures, scale_by_bars, scale_by_marks, similarity, triangulate
+from fabctl.vision.scale import (
+    Bar,
+    ShotPose,
+    marks_in_pictures,
+    scale_by_bars,
+    scale_by_marks,
+    scale_by_shots,
+    similarity,
+    triangulate,
+)
 
 SHEET = scale_marks((300.0, 200.0))
 PLACES_MM = {mark.id: np.array([mark.x_mm, mark.y_mm, 0.0]) for mark in SHEET.marks}
@@ -44,6 +54,34 @@ def test_marks_in_a_dozen_pictures_give_the_scale_to_a_fiftieth_of_a_percent() -
     assert abs(made.mm_per_unit_ratio / 37 - 1) < made.uncertainty_ratio < 1e-3
     corner = made.to_mm @ np.append(PLACES_MM[100] / 37, 1.0)
     assert corner[:3] == pytest.approx(PLACES_MM[100], abs=0.05)
+
+
+@pytest.mark.parametrize(("noise_px", "pose_rad"), [(0.03, 5e-5), (0.005, 5e-5)])
+def test_the_stated_uncertainty_covers_the_error_of_nearly_all_scans(noise_px: float, pose_rad: float) -> None:
+    """Errors of poses move all marks of a picture together and leave no misfit between the marks."""
+    errors, stated = np.array([_drawn(seed, noise_px, pose_rad) for seed in range(32)]).T
+    assert np.abs(errors).max() < 2e-4
+    assert np.mean(np.abs(errors) <= stated) >= 0.875  # 95 % of 32, less two standard deviations of chance
+    assert np.max(stated) < 2e-4  # nor so wide that the scale would not be known well enough
+
+
+def _drawn(seed: int, noise_px: float, pose_rad: float) -> tuple[float, float]:
+    """Return error and stated uncertainty of one scan whose pixels and poses are off by chance."""
+    import cv2
+
+    rng = np.random.default_rng([seed, 1])
+    shots = []
+    for k in range(12):
+        pose, seen = shot(k * np.pi / 6)
+        wobble = np.asarray(cv2.Rodrigues(rng.normal(0, pose_rad, 3))[0])
+        noisy = {number: pixel + rng.normal(0, noise_px, 2) for number, pixel in seen.items()}
+        shots.append((replace(pose, R=wobble @ pose.R, t=wobble @ pose.t), noisy))
+    made = scale_by_shots(shots, SHEET)
+    return made.mm_per_unit_ratio / 37 - 1, made.uncertainty_ratio
+
+
+def test_a_scale_that_hangs_on_one_picture_states_no_uncertainty() -> None:
+    assert np.isinf(scale_by_shots([shot(0.3), shot(1.9)], SHEET).uncertainty_ratio)
 
 
 @given(
