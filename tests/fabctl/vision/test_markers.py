@@ -119,3 +119,17 @@ def test_a_homography_is_found_again_from_its_points(shift: tuple[float, float],
     H = np.array([[1.2, 0.1, shift[0]], [-0.2, 0.9, shift[1]], [bend, 0.05, 1.0]])
     points = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1], [0.2, 0.3]])
     assert homography(points, warp(H, points)) == pytest.approx(H, abs=1e-8)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_pale_marker_on_a_grainy_sheet_beside_a_dark_ground_is_found(seed: int) -> None:
+    """Grain frays its outline in the full picture; a mark engraved on grey rubber looks like that."""
+    rng = np.random.default_rng(seed)
+    page = np.full((300, 300), 35.0)
+    page[40:, 45:] = 190.0
+    number = int(rng.integers(80, 100))
+    drawn = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250), number, 119)
+    page[95:214, 100:219] = np.where(drawn > 0, 190.0, 165.0)
+    grain = cv2.GaussianBlur(rng.normal(0, 1, page.shape), (0, 0), 1.5)
+    seen = cv2.GaussianBlur(page * (1 + 0.05 * grain / grain.std()), (0, 0), 1.3) + rng.normal(0, 2, page.shape)
+    assert [m.id for m in find_markers(np.clip(np.rint(seen), 0, 255).astype(np.uint8))] == [number]
