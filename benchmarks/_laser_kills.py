@@ -10,13 +10,11 @@ from collections.abc import Sequence
 
 from benchmarks._laser_rig import Killed, Rig, slits
 from drivers.grbl.laser import Laser
-from drivers.grbl.run import run_program
 from drivers.transport.tap import Tap
-from fabctl.cut.execute import CutWatch, no_keys
+from fabctl.cut.execute import run_plan
 from fabctl.cut.place import Affine
 from fabctl.cut.plan import CutPlan, program_times
 from fabctl.cut.program import Program, read_program
-from fabctl.cut.progress import Track
 from fabctl.cut.trail import MARK, PROGRAM_BEGINS, last_seen, read_trail, rest_of, stopped_at
 from fabctl.events import silent
 from simulators.grbl.board import Point
@@ -38,7 +36,7 @@ def follow(laser: Laser, program: Program, rows: list[str]) -> None:
     assert laser.identity is not None
     plan = CutPlan(program, program_times(program, laser.identity), Affine(), (0.0, 0.0, 0.0), ())
     rows.append(f'{{"t_s": 0, "dir": "{MARK}", "bytes": "{PROGRAM_BEGINS}"}}')
-    run_program(laser, plan.lines, CutWatch(plan, Track(program, plan.times, RUN_ON_S), silent, no_keys))
+    run_plan(laser, plan, RUN_ON_S, silent)
 
 
 def killed_run(seed: int, program: Program, absence_s: float | None = None) -> tuple[Rig, list[str], float]:

@@ -32,9 +32,10 @@ from benchmarks._deploy_cases import (
 from design.cells.library import load_library
 from design.deploy.compensate import Compensation, compensate
 from design.deploy.equilibrium import from_flat, rolled, solve_level
+from design.deploy.factor import factorise
 from design.deploy.indentation import Response, border, indentation_response
 from design.deploy.levels import Layout
-from design.deploy.newton import System, factorise, pins, solve
+from design.deploy.newton import System, pins, solve
 from design.deploy.predict import compared
 from design.deploy.search import equilibria
 from design.deploy.shell import Shell, build_shell

@@ -14,9 +14,10 @@ from design.deploy.compensate import compensate
 from design.deploy.equilibrium import solve_level
 from design.deploy.levels import Layout
 from design.deploy.shell import Reals
-from design.errors import NotConverged
+from design.errors import NotConverged, OutOfLibrary
 from design.findings import Finding
 from design.flatten import Flattening
+from design.hinged import Widening
 from design.pattern.tiling import Array, Tiling
 from design.predicted import layout_of, lifted, welded
 
@@ -30,23 +31,35 @@ def compensated(
     choice: Choice,
     cut: NDArray[np.bool_],
     library: CellLibrary,
-    curve: SelectionCurve,
+    curve: SelectionCurve | None,
+    wide: Widening | None,
     found: list[Finding],
-    watch: Callable[[float], None],
+    watch: Callable[[str, float], None],
 ) -> tuple[Array, Choice]:
     """Return what each cell must expand by and the cells for it; those given where other ones do not help.
 
     The misfit told is that of the cells chosen anew, with their own stiffness, not that of the optimisation's model.
+    Widening hinges run over the design's expansions, so new expansions are served from the curve over their own span.
+    Without a `curve` (the published rule) there is nothing to choose from, which is told.
     """
+    if curve is None:
+        text = "the published rule takes cells without scaling the flat: there is no size to compensate to"
+        hint = "take another selection rule"
+        found.append(Finding("COMPENSATE-NOT", f"the sheet was left as it was: {text}", "warning", hint=hint))
+        return wanted_ratio, choice
     layout, goal = welded(layout_of(tiling, choice, cut, library), tiling, lifted(flat, tiling.vertices_mm))
     try:
         before_mm = points_rms_mm(layout, goal)
-        answer = compensate(layout, goal, curve.range_ratio(), watch=watch, changeable=cut)
+        bounds = curve.range_ratio()
+        answer = compensate(
+            layout, goal, bounds, watch=lambda done: watch("compensating", 0.2 + 0.2 * done), changeable=cut
+        )
         asked = np.where(cut, answer.layout.expansion_ratio, wanted_ratio)
-        chosen = on_curve(curve, asked)
+        span = float(asked.min()), float(asked.max())
+        chosen = on_curve(curve if wide is None else wide.curve(span), asked)
         anew, goal = welded(layout_of(tiling, chosen, cut, library), tiling, lifted(flat, tiling.vertices_mm))
         after_mm = points_rms_mm(anew, goal)
-    except NotConverged as fault:
+    except (NotConverged, OutOfLibrary) as fault:
         found.append(Finding("COMPENSATE-NOT", f"the sheet was left as it was: {fault}", "warning"))
         return wanted_ratio, choice
     told = f"corresponding points {before_mm:.3f} mm from the target before, {after_mm:.3f} mm after (RMS)"

@@ -114,19 +114,9 @@ def build(
     flat = lay_flat(spec, mesh, curve, found)
     watch("choosing cells", 0.2)
     flat, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)
-    if spec.compensate and curve is not None:
+    if spec.compensate:
         cut = np.array([kind == "cut" for kind in kinds_of(spec, tiling)])
-        wanted, choice = compensated(
-            flat,
-            tiling,
-            wanted,
-            choice,
-            cut,
-            library,
-            curve,
-            found,
-            lambda done: watch("compensating", 0.2 + 0.2 * done),
-        )
+        wanted, choice = compensated(flat, tiling, wanted, choice, cut, library, curve, wide, found, watch)
     hinge = hinges_mm(spec, choice, library)
     if curve is None and np.abs(hinge - base.sheet.hinge_mm).max() > HINGE_SAME_MM:
         choice, changed = as_cut(base, choice, hinge)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from design.bundle import open_bundle
 from design.cells.bending_map import bending_for
+from design.cells.contracting import is_contracting
 from design.cells.hinges import with_hinge
 from design.cells.homogenise import CURVE_SHARES
 from design.cells.library import CellLibrary, hexagon_mm2
@@ -85,7 +86,10 @@ def read_laid(folder: Path, home: Path) -> Laid:
 
 
 def wells_of(laid: Laid) -> Wells:
-    """Return each cell's whole energy curve; raise `RefusedError` where a cell has no second state."""
+    """Return each cell's whole energy curve; raise `RefusedError` where a cell has no second state or closes."""
+    if is_contracting(laid.library):
+        fault = Finding("CASCADE-CLOSING", "the cells contract", hint="unit by unit goes with expanding cells only")
+        raise RefusedError("the sheet cannot be opened cell by cell", [fault])
     if np.any(laid.layout.expansion_ratio <= 1):
         fault = Finding("CASCADE-SOLID", "some cells are not cut or spring back", hint="they have no two wells to snap")
         raise RefusedError("the sheet cannot be opened cell by cell", [fault])

@@ -196,7 +196,8 @@ def follow(m: Model, reach_ratio: float) -> Pair | Failure:
             if sign * low.slope < 0:
                 return _pair(_crossing(m, last, low), _crossing(m, low, state))
         elif saddle is not None and rise >= 0:
-            return _pair(saddle, _crossing(m, last, state))
+            pair = _pair(saddle, _crossing(m, last, state))
+            return pair if isinstance(pair, Failure) or sign < 0 else _deepest(m, pair, state)
         last = state
     where = f"up to the stretch {reach_ratio:.3f}"
     if saddle is not None:
@@ -219,6 +220,28 @@ def _next(m: Model, last: State, sign: int = 1) -> State | Failure:
             return Failure(
                 "not converged", f"no equilibrium at the stretch {last.s_ratio + step:.4f}", state.residual_ratio
             )
+
+
+LOOK_RATIO = 0.06  # of the stretch, how far past a second state a deeper one is looked for
+
+
+def _deepest(m: Model, pair: Pair, past: State) -> Pair:
+    """Return the pair, with the deeper well behind it where the path drops into one.
+
+    A thin hinge snaps on the way down from the saddle, and may land in a shallow well with about twice the energy.
+    Stretched on it drops out of that; past the deepest well the energy only rises.
+    """
+    last, end = past, pair.stable.s_ratio + LOOK_RATIO
+    while last.s_ratio < end:
+        state = _next(m, last)
+        if isinstance(state, Failure):
+            break
+        if state.energy_mm2 < last.energy_mm2:
+            deeper = Pair(pair.saddle, root(m, state.y, state.s_ratio))
+            if is_pair(deeper) and deeper.stable.energy_mm2 < pair.stable.energy_mm2:
+                pair = deeper
+        last = state
+    return pair
 
 
 def _least_slope(m: Model, a: State, b: State, sign: int) -> State:

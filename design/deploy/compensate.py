@@ -14,8 +14,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from design.deploy.compare import kabsch
+from design.deploy.factor import factorise
 from design.deploy.levels import Layout
-from design.deploy.newton import Equilibrium, Load, System, factorise, pins, solve
+from design.deploy.newton import Equilibrium, Load, System, pins, solve
 from design.deploy.shell import Ints, Reals, neighbours
 from design.errors import NotConverged
 

@@ -41,6 +41,15 @@ class Layout:
         flat[self.cells[::-1].ravel()] = self.corners_mm[::-1].reshape(-1, 2)
         return flat
 
+    def rejoined_count(self) -> int:
+        """Return how many vertices lie at two places of the flat: those on a re-joined seam."""
+        corners, vertex = self.corners_mm.reshape(-1, 2), self.cells.ravel()
+        low = np.full((self.vertex_count, 2), np.inf)
+        high = -low
+        np.minimum.at(low, vertex, corners)
+        np.maximum.at(high, vertex, corners)
+        return int(np.sum(np.linalg.norm(high - low, axis=1) > self.edge_mm / 2))
+
     def shell(self) -> Shell:
         """Return the shell that these units make."""
         return build_shell(
@@ -136,11 +145,14 @@ def _largest_part(cells: Ints, corners_mm: Reals, edge_mm: float, mean: dict[str
 
 
 def levels(layout: Layout) -> list[Layout]:
-    """Return the sheet and its coarser versions, coarsest first."""
+    """Return the sheet and its coarser versions, coarsest first.
+
+    A tube with an odd number of units around has no coarser version: twice as large units do not meet at its seam.
+    """
     chain = [layout]
     while len(chain[-1].cells) >= 3 * SMALLEST_COUNT:
         coarser = coarsen(chain[-1])
-        if coarser is None:
+        if coarser is None or (layout.rejoined_count() and not coarser.rejoined_count()):
             break
         chain.append(coarser)
     return chain[::-1]

@@ -13,9 +13,10 @@ from typing import Protocol
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 from design.deploy import kernels
+from design.deploy.factor import Factor, factorise
 from design.deploy.shell import Ints, Reals, Shell
 from design.errors import NotConverged
 
@@ -140,16 +141,7 @@ class System:
         return self._matrix(data)
 
 
-def factorise(matrix: sp.csc_matrix) -> tuple[SuperLU, int]:
-    """Return the factorisation and the number of negative pivots (= negative eigenvalues, by Sylvester's law).
-
-    Raises `RuntimeError` where a pivot is exactly zero.
-    """
-    lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return lu, int(np.sum(lu.U.diagonal() < 0))
-
-
-def _convex(system: System, matrix: sp.csc_matrix, shift: float, first_shift: float) -> tuple[SuperLU, float]:
+def _convex(system: System, matrix: sp.csc_matrix, shift: float, first_shift: float) -> tuple[Factor, float]:
     """Return the factorisation of the matrix shifted as little as makes it positive, and that shift."""
     while True:
         try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 from drivers.errors import DeviceError, DeviceTimeout
@@ -38,6 +38,7 @@ class Progress:
     answered_count: int
     report: Report | None
     held: bool
+    time_s: float | None = None  # of a finished run: from its first line until the board was seen standing at its end
 
 
 class Watcher(Protocol):
@@ -178,21 +179,24 @@ def run_program(laser: Laser, lines: Sequence[str], watcher: Watcher) -> Progres
     if start.state != "Idle":
         raise DeviceTimeout(WHO, "by being idle", 0.0, f"it says {start.state}; home or unlock it first")
     run = _Run(laser.link, Stream(lines, identity.rx_bytes), watcher, start.free_bytes)
-    run.changed_s = laser.clock.now_s()
+    run.changed_s = began_s = laser.clock.now_s()
     laser.begin()
     try:
         while not run.stream.done:
             run.step()
-        _await_standstill(run)
+        stood_s = _await_standstill(run)
     except BaseException:  # Ctrl-C too: the beam is off on every way out
         laser.off()
         raise
     laser.end()
-    return run.progress()
+    return replace(run.progress(), time_s=stood_s - began_s)
 
 
-def _await_standstill(run: _Run) -> None:
-    """The last answer says that the queue is empty; see it confirmed, and listen for an answer too many."""
+def _await_standstill(run: _Run) -> float:
+    """Return when the board was first seen standing with all answered; then listen for an answer too many.
+
+    Listening takes `IDLE_PROOF_S` of the host's time, in which the board does nothing: it belongs to no job's time.
+    """
     clock = run.link.clock
     end_s, idle_s = clock.now_s() + END_S, math.inf
     while clock.now_s() < min(end_s, idle_s + IDLE_PROOF_S):
@@ -202,3 +206,4 @@ def _await_standstill(run: _Run) -> None:
             idle_s = clock.now_s()
     if math.isinf(idle_s):
         raise DeviceTimeout(WHO, "the end of the job by becoming idle", END_S)
+    return idle_s

@@ -77,6 +77,26 @@ def _terminate(_signal: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def run_to_the_end(command: click.Command) -> int:
+    """Run `command` as the last thing this process does; return its exit code.
+
+    A second Ctrl-C may come at any moment of the way out: it must not change the exit code.
+    """
+    try:
+        try:
+            return run_guarded(command)
+        finally:
+            _deafen()
+    except KeyboardInterrupt:
+        _deafen()
+        return OPERATOR
+
+
+def _deafen() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
 def run_guarded(command: click.Command) -> int:
     """Run `command` and return its exit code (`fabctl.errors` lists them)."""
     signal.signal(signal.SIGTERM, _terminate)

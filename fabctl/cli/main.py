@@ -63,9 +63,9 @@ def cli(ctx: click.Context, home: str | None) -> None:
 
 def main() -> None:
     """Run the command line; every error ends here, as a message and an exit code."""
-    from fabctl.cli.common import run_guarded
+    from fabctl.cli.common import run_to_the_end
 
-    sys.exit(run_guarded(cli))
+    sys.exit(run_to_the_end(cli))
 
 
 if __name__ == "__main__":

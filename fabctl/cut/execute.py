@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from design.findings import Finding
 from drivers.errors import DeviceError
 from drivers.grbl.laser import Laser
 from drivers.grbl.meanings import error_meaning
 from drivers.grbl.run import Progress, Wish, run_program
-from fabctl.cut.plan import CutPlan, head_mm
+from fabctl.cut.plan import CutPlan, head_mm, program_times
+from fabctl.cut.program import read_program
 from fabctl.cut.progress import LOST_MM, Track
 from fabctl.errors import RefusedError
 from fabctl.events import Emit, Event
@@ -133,10 +134,23 @@ def check_on_board(laser: Laser, lines: Sequence[str]) -> None:
         raise RefusedError("the board refuses the program in its check mode; nothing has moved", found)
 
 
+def from_here(laser: Laser, plan: CutPlan) -> CutPlan:
+    """Return the plan as it begins where the head is now: it may have been homed, or have framed, since it was made.
+
+    Only the way to the first stroke differs; without it, that way would be taken for a machine that has lost steps.
+    """
+    assert laser.identity is not None, "connect comes first"
+    program = read_program(
+        plan.lines, laser.identity.setting(12) or 0.002, head_mm(laser.report(), plan.work_offset_mm)
+    )
+    return replace(plan, program=program, times=program_times(program, laser.identity))
+
+
 def run_plan(
     laser: Laser, plan: CutPlan, max_run_on_s: float, emit: Emit, keys: Callable[[], Wish] = no_keys
 ) -> tuple[Progress, Track]:
-    """Stream the plan and return when the board stands idle at its end."""
+    """Stream the plan from where the head is, and return when the board stands idle at its end."""
+    plan = from_here(laser, plan)
     track = Track(plan.program, plan.times, max_run_on_s)
     progress = run_program(laser, plan.lines, CutWatch(plan, track, emit, keys))
     return progress, track

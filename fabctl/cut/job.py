@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,20 +18,19 @@ from design.findings import Finding, errors
 from drivers.clock import WallClock
 from drivers.errors import DeviceError
 from drivers.grbl.laser import Laser
-from drivers.grbl.messages import Report
-from drivers.grbl.run import StoppedByOperator, Wish, run_program
-from drivers.grbl.settings import Identity
+from drivers.grbl.messages import Info, Report
+from drivers.grbl.run import StoppedByOperator, Wish
+from drivers.grbl.settings import Identity, identify
 from drivers.transport import open_transport
 from drivers.transport.tap import Tap
 from fabctl.bench import Bench
 from fabctl.config.bench import BenchConfig, LaserConfig
 from fabctl.config.material import MaterialConfig
-from fabctl.cut.execute import CutWatch, check_on_board, minutes, no_keys, run_plan
-from fabctl.cut.place import Affine, Origin, placement
+from fabctl.cut.execute import check_on_board, minutes, no_keys, run_plan
+from fabctl.cut.place import Affine, Origin, homed_mm, placement
 from fabctl.cut.plan import CutPlan, frame_lines, plan_cut, program_times
 from fabctl.cut.preflight import Sheet
 from fabctl.cut.program import read_program
-from fabctl.cut.progress import Track
 from fabctl.cut.trail import PROGRAM_BEGINS
 from fabctl.cut.wirelog import WireLog
 from fabctl.errors import FabctlError, RefusedError, Stopped, UsageError
@@ -173,7 +171,8 @@ def _plan(laser: Laser, bench: Bench, order: CutOrder, specimen: str) -> CutPlan
     affine = _affine(order, config, identity, report)
     lines = order.compose(specimen, identity.setting(30) or 1000.0)
     known = will_home or (identity.is_on(22) and report.state == "Idle")
-    plan = plan_cut(lines, affine, identity, report, config, order.material, order.sheet, known)
+    begin = replace(report, machine_mm=homed_mm(identity, config.travel_mm), work_mm=None) if will_home else report
+    plan = plan_cut(lines, affine, identity, begin, config, order.material, order.sheet, known)
     if order.eye is None:
         return plan
     return replace(plan, findings=(*plan.findings, *_unhomed(known), *order.eye.against(plan)))
@@ -363,9 +362,8 @@ def execute(
     if order.frame:
         frame(laser, plan, order, config, desk)
     desk.emit(Event("stage", f"cutting, {minutes(plan.times.total_s)}", data={"mark": PROGRAM_BEGINS}))
-    began_s = time.monotonic()
-    progress, _ = run_plan(laser, plan, config.max_run_on_s, desk.emit, desk.keys)
-    actual_s = time.monotonic() - began_s
+    progress, track = run_plan(laser, plan, config.max_run_on_s, desk.emit, desk.keys)
+    plan, actual_s = replace(plan, times=track.times), progress.time_s or 0.0
     result = {
         **summary(plan, identity_of(laser)),
         "actual_s": round(actual_s, 2),
@@ -380,9 +378,6 @@ def execute(
 
 def recheck_offset(laser: Laser, plan: CutPlan) -> None:
     """Check mode restarts the board: the work offset must still be the one the plan was made for."""
-    from drivers.grbl.messages import Info
-    from drivers.grbl.settings import identify
-
     answers = [m for m in (*laser.ask("$#"), *laser.ask("$G")) if isinstance(m, Info)]
     laser.end()
     now = identify(answers, None).work_offset_mm()
@@ -399,7 +394,6 @@ def frame(laser: Laser, plan: CutPlan, order: CutOrder, config: LaserConfig, des
     full = identity_of(laser).setting(30) or 1000.0
     program = read_program(frame_lines(plan, order.frame_power_frac * full))
     around = CutPlan(program, program_times(program, identity_of(laser)), plan.affine, plan.work_offset_mm, ())
-    track = Track(program, around.times, config.max_run_on_s)
-    run_program(laser, around.lines, CutWatch(around, track, desk.emit, desk.keys))
+    run_plan(laser, around, config.max_run_on_s, desk.emit, desk.keys)
     if not desk.ask("The head went around the job. Does it fit the sheet?"):
         raise Stopped("not cut: the frame did not fit")

@@ -63,6 +63,15 @@ def travel_box_mm(identity: Identity, travel_mm: tuple[float, float]) -> tuple[f
     return x[0], y[0], x[1], y[1]
 
 
+def homed_mm(identity: Identity, travel_mm: tuple[float, float]) -> Vector:
+    """Return where the head stands after homing: `$27` off the switches, which `$23` puts at either end; or at zero."""
+    if identity.homes_to_zero:
+        return 0.0, 0.0, 0.0
+    off_mm, mask = identity.setting(27) or 0.0, int(identity.setting(23) or 0)
+    low_x, low_y, _, _ = travel_box_mm(identity, travel_mm)
+    return low_x + off_mm if mask & 1 else -off_mm, low_y + off_mm if mask & 2 else -off_mm, 0.0
+
+
 def placement(
     origin: Origin,
     identity: Identity,

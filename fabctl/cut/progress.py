@@ -11,9 +11,10 @@ from fabctl.cut.estimate import Estimate
 from fabctl.cut.program import Program, Step
 
 NEAR_MM = 0.05
-LEAST_AHEAD_S = 0.15  # of burning is always sent ahead: two reports and their way back; less would stutter
+LEAST_AHEAD_S = 0.15  # of burning is sent ahead where slits are shorter: two reports and their way back
 LOST_MM = 1.0
-SLACK_MM = 0.05  # a report is rounded, and the place it names lies a little behind the line it ended
+OVERLAP_MM = 0.1  # cut again before the last place seen: homing finds its switches only to about this
+SLACK_MM = 0.002  # a report is rounded
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +80,15 @@ class Track:
         self._last_step = last_steps(self.program)
         self.line_end_s = [self.times.end_s[k] if k >= 0 else 0.0 for k in self._last_step]
         self._burnt_mm, self._stroke_mm = burnt_mm(self.program.steps)
+        self._longest_mm = max(self._stroke_mm, default=0.0)
         self._line_burnt_mm = [self._burnt_mm[k + 1] for k in self._last_step]
 
     def limit_count(self) -> int:
         """Return how many lines may have been sent.
 
         So many that the board never holds more than `max_run_on_s` of work, nor more burning beyond the place it last
-        reported than one stroke: should its position be lost, no more than that can be burnt twice.
+        reported than one stroke (this one, the next one, or the program's longest where that is too little to run
+        smoothly): should its position be lost, no more than that can be burnt twice.
         """
         allowed = bisect_right(self.line_end_s, self.done_s + self.max_run_on_s)
         allowed = min(allowed, bisect_right(self._line_burnt_mm, self._burn_limit_mm()))
@@ -98,12 +101,12 @@ class Track:
         k = min(bisect_right(self.times.end_s, self.done_s), len(self.program.steps) - 1)
         step, done = self.program.steps[k], self._burnt_mm[k]
         if self.place is not None and self.place.step_index == k and step.burns:
-            done += step.length_mm * self.place.along_ratio
+            done += max(step.length_mm * self.place.along_ratio - OVERLAP_MM, 0.0)  # where it would be gone on from
         ahead = bisect_right(self._burnt_mm, self._burnt_mm[k + 1])  # the first step that burns after this one
         next_mm = self._stroke_mm[ahead - 1] if ahead <= len(self._stroke_mm) else 0.0
         cut = step if step.burns or not next_mm else self.program.steps[ahead - 1]
         least_mm = LEAST_AHEAD_S * cut.speed_mm_s if math.isfinite(cut.speed_mm_s) else 0.0
-        return done + max(self._stroke_mm[k], next_mm, least_mm) + SLACK_MM
+        return done + max(self._stroke_mm[k], next_mm, min(least_mm, self._longest_mm)) + SLACK_MM
 
     def _first_open_line(self) -> int:
         return bisect_right(self.line_end_s, self.done_s)

@@ -8,13 +8,12 @@ from drivers.grbl.messages import Listener, Ok, Report, Vector
 from drivers.transport.tap import read_log
 from fabctl.cut.estimate import Estimate
 from fabctl.cut.program import Modes, Program, Step, decimal
-from fabctl.cut.progress import NEAR_MM, Place, last_steps, locate
+from fabctl.cut.progress import NEAR_MM, OVERLAP_MM, Place, last_steps, locate
 
 MARK = "#"  # direction of a row in `wire.log` that is no byte but a remark
 PROGRAM_BEGINS = "program begins"
 EXACT_MM = 0.01  # two steps of a usual machine, and the rounding of its report
 POWER_UP_MM = 0.0005
-OVERLAP_MM = 0.1  # cut again before the last place seen: homing finds its switches only to about this
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from benchmarks._laser_kills import PROGRAM, RUN_ON_S, killed_run, missing_count, resumed, twice_mm
-from benchmarks._laser_rig import lit_while_standing
+from benchmarks._laser_rig import lit_while_standing, slits
 from fabctl.cut.program import read_program
 
 KILLS = range(10)  # `python -m benchmarks laser` does a hundred
@@ -46,3 +46,13 @@ def test_a_board_that_ran_on_alone_and_then_restarted_burns_at_most_one_slit_twi
     assert not resumed(rig, rows, program, died_s, restart=True)
     assert missing_count(rig, program) == 0
     assert twice_mm(rig, program) <= SLIT_MM
+
+
+@pytest.mark.parametrize("length_mm", [1.0, 2.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_of_slits_shorter_than_two_reports_no_more_than_one_is_burnt_twice_either(seed: int, length_mm: float) -> None:
+    program = read_program(slits(30, length_mm=length_mm))
+    rig, rows, died_s = killed_run(seed, program, absence_s=8.0)
+    assert not resumed(rig, rows, program, died_s, restart=True)
+    assert missing_count(rig, program) == 0
+    assert twice_mm(rig, program) <= length_mm

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from drivers.grbl.messages import Report
 from drivers.grbl.settings import Identity, Settings
 from fabctl.config.bench import LaserConfig
 from fabctl.config.material import LaserPreset, LayerConfig, MaterialConfig
+from fabctl.cut import job
 from fabctl.cut.estimate import Dynamics, estimate
 from fabctl.cut.place import Affine, lay, read_affine, travel_box_mm
 from fabctl.cut.plan import frame_lines, plan_cut, with_air, with_lit_ends
@@ -58,9 +60,7 @@ def test_a_good_job_has_no_findings() -> None:
     assert codes() == set()
 
 
-@pytest.mark.parametrize(
-    ("expected", "changes"),
-    [
+REASONS: list[tuple[str, dict[str, object]]] = [
         ("CUT-X", {"lines": ("G21", "M8", "M4S0", "G1X1Y-5F1500S500", "M5")}),
         ("CUT-Y", {"lines": ("G21", "M8", "M4S0", "G1X-1Y-205F1500S500", "M5")}),
         ("CUT-S", {"board": with_settings(_30=255.0)}),
@@ -92,10 +92,48 @@ def test_a_good_job_has_no_findings() -> None:
         ("CUT-PRESET", {"material": RUBBER.model_copy(update={"laser": None})}),
         ("CUT-SHEET", {"sheet": Sheet("other", 2.3)}),
         ("CUT-SHEET", {"sheet": Sheet("rubber", 2.0)}),
-    ],
-)  # fmt: skip
+        ("CUT-S", {"board": replace(BOARD, settings=Settings({k: v for k, v in BOARD.settings.items() if k != 30}))}),
+        ("CUT-RATE", {"board": with_settings(_111=1000.0)}),
+        ("CUT-TRAVEL", {"board": with_settings(_131=250.0)}),
+        ("CUT-STARTUP", {"board": replace(BOARD, startup=("", "M3S9"))}),
+        ("CUT-OVERRIDE", {"report": replace(IDLE, overrides=(100, 100, 90))}),
+        ("CUT-SWITCH", {"report": replace(IDLE, pins="PY")}),
+        *(("CUT-STATE", {"report": replace(IDLE, state=state)}) for state in ("Run", "Hold", "Jog", "Check", "Sleep")),
+        ("CUT-EMPTY", {"lines": ("G21", "M8", "G0X-5")}),
+        ("CUT-FORBIDDEN", {"lines": (*GOOD, "G2X-180Y-90R5F600")}),
+        ("CUT-FORBIDDEN", {"lines": (*GOOD, "G92X0")}),
+        ("CUT-FORBIDDEN", {"lines": (*GOOD, "G38.2X-9F50")}),
+        ("CUT-FORBIDDEN", {"lines": (*GOOD, "T1")}),
+        ("CUT-FORBIDDEN", {"lines": (*GOOD, "M98")}),
+]  # fmt: skip
+WARNINGS = {"CUT-S-MIN", "CUT-SOFT-LIMITS", "CUT-TRAVEL", "CUT-ZERO"}
+
+
+@pytest.mark.parametrize(("expected", "changes"), REASONS)
 def test_each_reason_against_a_cut_is_found(expected: str, changes: dict[str, object]) -> None:
     assert expected in codes(**changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("expected", "changes"), REASONS)
+def test_whatever_is_wrong_stops_the_cut_but_for_the_few_that_only_warn(
+    expected: str, changes: dict[str, object]
+) -> None:
+    program = read_program(changes.get("lines", GOOD))  # type: ignore[arg-type]
+    rest = {key: value for key, value in changes.items() if key != "lines"}
+    given = {"board": BOARD, "report": IDLE, "material": RUBBER, "sheet": None, "homed": True, **rest}
+    found = preflight(
+        program, given["board"], given["report"], LASER, given["material"], (0.0, 0.0, 0.0), given["sheet"],
+        given["homed"],  # type: ignore[arg-type]
+    )  # fmt: skip
+    levels = {finding.level for finding in found if finding.code == expected}
+    untold_power = expected == "CUT-S" and given["board"].setting(30) is None  # type: ignore[attr-defined]
+    assert levels == {"warning" if expected in WARNINGS or untold_power else "error"}
+
+
+def test_no_reason_is_without_its_row() -> None:
+    text = "".join((Path(job.__file__).parent / name).read_text() for name in ("preflight.py", "program.py"))
+    written = set(re.findall(r'"(CUT-[A-Z0-9-]+)"', text)) | {"CUT-X", "CUT-Y"}
+    assert written == {code for code, _ in REASONS}
 
 
 def test_all_reasons_are_found_at_once() -> None:

@@ -331,3 +331,12 @@ def test_gradient_and_hessian_of_the_periodic_cell_match_differences(solved: tup
     assert slope == pytest.approx(at.grad @ free + at.stress @ strain, rel=1e-6)
     mixed = 2 * free @ at.mixed @ strain + strain @ at.strain_hessian @ strain
     assert curve == pytest.approx(free @ (at.hessian @ free) + mixed, rel=1e-6)
+
+
+def test_a_thin_hinge_that_snaps_into_a_shallow_well_is_found_in_the_deep_one() -> None:
+    """From rest the two middle cells first come to a well at 1.35 with twice the energy."""
+    t_mm = np.array([0.804, 0.809, 0.814, 0.819])
+    cells = [solve_cell(float(t), math.radians(14.61), replace(SHEET, hinge_mm=0.20)) for t in t_mm]
+    for name, share in (("expansion_ratio", 1e-5), ("stored_mm2", 1e-3)):
+        values = np.array([getattr(cell, name) for cell in cells])
+        assert values == pytest.approx(np.polyval(np.polyfit(t_mm, values, 1), t_mm), rel=share)

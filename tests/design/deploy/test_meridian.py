@@ -22,10 +22,14 @@ def test_the_meridian_begins_with_reissners_stiffness() -> None:
     assert load / 0.02 == pytest.approx(8 * np.sqrt(D * Y) / R, rel=0.05)
 
 
-def test_triangles_and_meridian_agree_while_the_indenter_goes_in(cap_of) -> None:
+def test_triangles_come_to_the_meridians_load_as_they_get_smaller(cap_of) -> None:
     cap = cap_of(D_mJ=D)
     found = solve_level(cap.layout, cap.design_mm)
-    response = indentation_response(cap.layout, found.x_mm, 8.0, 2.0, steps_count=4, parts=3)
     meridian, nodes = spherical(R, np.pi / 3, 121, even)
-    loads = pressed_N(meridian, nodes, 8.0, response.depth_mm[1:])
-    assert response.load_N[1:] == pytest.approx(loads, rel=0.1)
+    wanted = pressed_N(meridian, nodes, 8.0, np.array([1.0, 2.0]))
+    off = {}
+    for parts in (2, 4):
+        response = indentation_response(cap.layout, found.x_mm, 8.0, 2.0, steps_count=2, parts=parts)
+        off[parts] = response.load_N[1:] / wanted - 1
+    assert (np.abs(off[4]) < 0.5 * np.abs(off[2])).all()  # 13 % softer, then 4.5 %; 2 % with 6² a unit
+    assert (np.abs(off[4]) < 0.06).all()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from design.deploy.factor import factorise
 from design.deploy.indentation import Sphere
-from design.deploy.newton import System, factorise, fold_angles, pins, smallest_eigenvalue_N_mm, solve
+from design.deploy.newton import System, fold_angles, pins, smallest_eigenvalue_N_mm, solve
 from design.deploy.shell import build_shell, neighbours, rest_sides_mm
 
 

@@ -10,11 +10,12 @@ import pytest
 from click.testing import CliRunner
 
 from design.bundle import open_bundle
+from design.cells.hinges import cells_as_cut
 from design.errors import BundleError
 from design.meshfiles import read_mesh
 from fabctl.cli.deploy import command
-from fabctl.deploying import read_laid
-from fabctl.designing import build_compensated, build_folder
+from fabctl.deploying import read_laid, wells_of
+from fabctl.designing import build_compensated, build_folder, design_of, read_inputs
 from fabctl.errors import RefusedError
 
 
@@ -104,6 +105,41 @@ def test_a_sheet_that_compensation_does_not_help_is_refused(tmp_path: Path, monk
         build_compensated(bundle, tmp_path / "y", tmp_path)
     assert [finding.code for finding in refused.value.findings] == ["COMPENSATE-NOT"]
     assert not (tmp_path / "y").exists()
+
+
+@pytest.mark.parametrize("kind", ["hinge: {rule: widening}", "cells: contracting\ncell_mm: 18"])
+def test_other_cells_are_compensated_with_what_they_are_cut_as(tmp_path: Path, kind: str) -> None:
+    text = "name: x\ntarget: {make: cap, radius_mm: 60, edge_mm: 5}\nresponse: {steps_count: 4, depth_mm: 1}\n"
+    (tmp_path / "x.yaml").write_text(text + kind + "\ncompensate: true\n")
+    design = design_of(read_inputs(str(tmp_path / "x.yaml"), tmp_path, None, None))
+    assert "COMPENSATED" in [finding.code for finding in design.findings]
+    assert design.predicted is not None
+    assert design.predicted.deployed.deviation.points_rms_mm < 0.15  # 0.4 to 0.7 mm without
+    choice, hinge = design.cells.choice, design.cells.hinge_mm
+    if "widening" in kind:  # a cell's hinge, cut, must be the one that its t and angle were chosen with
+        library = read_inputs(str(tmp_path / "x.yaml"), tmp_path, None, None).library
+        as_they_are = cells_as_cut(library, choice.t_mm, choice.theta_rad, hinge)["expansion_ratio"]
+        assert as_they_are == pytest.approx(choice.expansion_ratio, abs=2e-3)
+
+
+def test_the_published_rule_says_why_it_is_not_compensated(tmp_path: Path) -> None:
+    text = "name: x\ntarget: {make: cap, radius_mm: 60, edge_mm: 5}\nselection: {rule: published}\n"
+    (tmp_path / "x.yaml").write_text(text + "cell_mm: 20\ncompensate: true\n")
+    design = design_of(read_inputs(str(tmp_path / "x.yaml"), tmp_path, None, None))
+    told = [finding.message for finding in design.findings if finding.code == "COMPENSATE-NOT"]
+    assert len(told) == 1
+    assert "published rule" in told[0]
+
+
+def test_contracting_cells_are_not_opened_unit_by_unit(tmp_path: Path) -> None:
+    text = "name: x\ntarget: {make: cap, radius_mm: 60, edge_mm: 5}\ncells: contracting\ncell_mm: 20\n"
+    (tmp_path / "x.yaml").write_text(text + "response: {steps_count: 4, depth_mm: 1}\n")
+    build_folder(str(tmp_path / "x.yaml"), tmp_path / "x", tmp_path)
+    laid = read_laid(tmp_path / "x", tmp_path)
+    assert (laid.layout.expansion_ratio < 1).all()
+    with pytest.raises(RefusedError) as refused:
+        wells_of(laid)
+    assert [finding.code for finding in refused.value.findings] == ["CASCADE-CLOSING"]
 
 
 def test_a_design_is_opened_unit_by_unit(folder: Path, tmp_path: Path) -> None:

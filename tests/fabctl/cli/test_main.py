@@ -72,3 +72,33 @@ def test_a_refusal_names_all_its_findings(monkeypatch: pytest.MonkeyPatch, capsy
     monkeypatch.setattr(sys, "argv", ["fabctl"])
     assert run_guarded(command) == REFUSED
     assert {"CUT-X", "CUT-S"} <= set(capsys.readouterr().err.replace(":", " ").split())
+
+
+WAY_OUT = """
+import os, signal, sys, click
+from fabctl.cli import common
+from fabctl.errors import Stopped
+
+def interrupt(*_):
+    os.kill(os.getpid(), signal.{name})
+
+@click.command()
+def command():
+    raise Stopped("stopped")
+
+sys.argv = ["fabctl"]
+common.say = interrupt if {early} else common.say
+code = common.run_to_the_end(command)
+interrupt()
+sys.exit(code)
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("early", [True, False])
+def test_a_second_interrupt_on_the_way_out_changes_no_exit_code(name: str, early: bool) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WAY_OUT.format(name=name, early=early)], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == OPERATOR, done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,87 @@
+"""What the board itself, or the state it is in, has against a program is found before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from benchmarks._laser_rig import LAB, Rig
+from drivers.grbl.laser import Laser
+from fabctl.config.bench import LaserConfig
+from fabctl.cut.by_hand import run_here
+from fabctl.cut.execute import check_on_board
+from fabctl.cut.job import recheck_offset
+from fabctl.cut.place import Affine
+from fabctl.cut.plan import CutPlan, program_times
+from fabctl.cut.program import read_program
+from fabctl.errors import RefusedError
+from fabctl.events import silent
+from simulators.grbl.machine import State
+
+HERE = ("G21", "G90", "G94", "M4S0", "G1X-5F600S{s}", "M5", "G4P0.01")
+BENCH: Any = SimpleNamespace(
+    config=SimpleNamespace(name="small", laser=LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0)))
+)
+
+
+def connected(rig: Rig) -> Laser:
+    laser = rig.laser()
+    laser.connect()
+    return laser
+
+
+def refusal(run: Any) -> set[str]:
+    with pytest.raises(RefusedError) as caught:
+        run()
+    return {finding.code for finding in caught.value.findings}
+
+
+def assert_stands(rig: Rig, laser: Laser) -> None:
+    assert laser.report().machine_mm == (-1.0, -1.0, -1.0)
+    assert all(point.power_frac == 0 for point in rig.trace)
+
+
+def test_every_line_that_the_board_refuses_in_check_mode_is_named() -> None:
+    rig = Rig()
+    laser = connected(rig)
+    with pytest.raises(RefusedError) as caught:
+        check_on_board(laser, ["G21", "G1X-5F600", "G1X-9", "M117", "G2X-90R0.1"])
+    assert [(f.code, f.where) for f in caught.value.findings] == [("CUT-BOARD", "line 4"), ("CUT-BOARD", "line 5")]
+    assert_stands(rig, laser)
+
+
+def test_an_offset_that_changed_since_the_plan_is_found() -> None:
+    laser = connected(Rig())
+    assert laser.identity is not None
+    program = read_program(HERE[:2])
+    plan = CutPlan(program, program_times(program, laser.identity), Affine(), (0.0, 0.0, 0.0), ())
+    recheck_offset(laser, plan)
+    laser.ask("G10L2P1X-7")
+    assert refusal(lambda: recheck_offset(laser, plan)) == {"CUT-OFFSET"}
+
+
+@pytest.mark.parametrize(
+    ("expected", "settings", "lines"),
+    [
+        ("CUT-LASER-MODE", {32: 0}, HERE),
+        ("CUT-TRAVEL", {}, ("G21", "G90", "M4S0", "G1X90F600S{s}", "M5")),
+    ],
+)
+def test_by_hand_too_nothing_moves_that_could_not_end_well(
+    expected: str, settings: dict[int, float], lines: Sequence[str]
+) -> None:
+    rig = Rig(settings={**LAB, **settings})
+    laser = connected(rig)
+    assert refusal(lambda: run_here(laser, BENCH, lines, 0.1, silent)) == {expected}
+    assert_stands(rig, laser)
+
+
+def test_a_locked_board_runs_nothing_by_hand() -> None:
+    rig = Rig()
+    laser = connected(rig)
+    rig.board.machine.state = State.ALARM
+    assert refusal(lambda: run_here(laser, BENCH, HERE, 0.1, silent)) == {"CUT-LOCKED"}
+    assert_stands(rig, laser)
