@@ -8,6 +8,7 @@ from typing import Any, cast
 import click
 
 from fabctl.cli.common import json_option, lab, progress, say, show
+from fabctl.cli.finite import numbers
 from fabctl.events import Event
 
 
@@ -136,12 +137,8 @@ def compare(a: Path, b: Path, as_json: bool) -> None:
 def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, as_json: bool) -> None:
     """Make a sheet of uniform patches, one a hinge width, to check the library on the real material."""
     from fabctl.designing import write_coupon
-    from fabctl.errors import UsageError
 
-    try:
-        hinges = [float(word) for word in hinges_mm.split(",")]
-    except ValueError:
-        raise UsageError(f"--hinges-mm takes numbers parted by commas, not {hinges_mm!r}") from None
+    hinges = numbers(hinges_mm, "--hinges-mm")
     patches = write_coupon(output, expansion_ratio, hinges, material, lab().root)
     lines = [f"{output}: {len(patches)} patches"]
     for patch in patches:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import bench_option, json_option, lab, show
+from fabctl.cli.finite import numbers
 
 if TYPE_CHECKING:
     from fabctl.vision.kerf import KerfMeasurement
@@ -48,7 +49,7 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
         raise UsageError(f"bench {bench_name} has no laser")
     slit, engrave = stuff.laser.slit, stuff.laser.engrave
     steps = (
-        _powers(powers)
+        numbers(powers, "--powers")
         if powers
         else [round(slit.power_frac * k, 4) for k in (0.8, 1.0, 1.2) if slit.power_frac * k <= 1]
     )
@@ -150,10 +151,3 @@ def _write_kerf(name: str, known_as: str, kerf_mm: float) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, changed)
     return path
-
-
-def _powers(text: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise click.UsageError(f"--powers {text!r} is not like 0.4,0.5,0.6") from None

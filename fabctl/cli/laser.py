@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.finite import numbers
 
 if TYPE_CHECKING:
     from drivers.grbl.laser import Laser
@@ -217,9 +218,9 @@ def testgrid(
     from fabctl.cut.testgrid import Grid, grid_lines, size_mm
 
     grid = Grid(
-        tuple(_numbers(powers, "--powers")),
-        tuple(_numbers(feeds, "--feeds")),
-        tuple(int(value) for value in _numbers(passes, "--passes")),
+        tuple(numbers(powers, "--powers")),
+        tuple(numbers(feeds, "--feeds")),
+        tuple(int(value) for value in numbers(passes, "--passes")),
         cell_mm,
     )
     if not all(0 < power <= 1 for power in grid.powers_frac) or min(grid.feeds_mm_s) <= 0 or min(grid.passes) < 1:
@@ -239,10 +240,3 @@ def testgrid(
             raise click.Abort
         time_s = run_here(laser, bench, lines, 0.0, progress())
     show({**facts, "actual_s": time_s}, as_json, [f"cut in {time_s:.0f} s"])
-
-
-def _numbers(text: str, option: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise click.UsageError(f"{option}: numbers with commas between them, not {text!r}") from None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from fabctl.cli.common import json_option, lab, progress, say, show
+from fabctl.cli.finite import PictureFile
 
 if TYPE_CHECKING:
     from design.cells.compare import Comparison, Unanswered
@@ -160,7 +161,7 @@ def show_command(file: Path | None, as_json: bool) -> None:
 @file_option
 @click.option("--t-mm", type=float, help="Plot energy and force of this cell instead of the maps.")
 @click.option("--theta-deg", type=float)
-@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("library.svg"), show_default=True)
+@click.option("-o", "--output", type=PictureFile(), default=Path("library.svg"), show_default=True)
 @json_option
 def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output: Path, as_json: bool) -> None:
     """Draw the four maps, or energy and force of one cell along its uniaxial stretch."""
@@ -201,7 +202,7 @@ def _refuse(t_mm: float, theta_deg: float, why: Failure) -> NoReturn:
 @t_option
 @theta_option
 @material_option
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Draw the states of the cell into this file.")
+@click.option("-o", "--output", type=PictureFile(), help="Draw the states of the cell into this file.")
 @json_option
 def cell_command(t_mm: float, theta_deg: float, material: str, output: Path | None, as_json: bool) -> None:
     """Solve one cell: its numbers and slits, and with -o a picture of its states."""

@@ -8,6 +8,7 @@ import sys
 import click
 
 from fabctl import __version__
+from fabctl.cli.finite import finite
 
 # noun -> (module, one line of help); the line stands here so that `fabctl --help` imports nothing else.
 NOUNS: dict[str, tuple[str, str]] = {
@@ -44,7 +45,7 @@ class LazyGroup(click.Group):
         if name not in NOUNS:
             return None
         command: click.Command = importlib.import_module(NOUNS[name][0]).command
-        return command
+        return finite(command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of nouns without importing them."""

@@ -109,7 +109,9 @@ def test_a_sheet_engraved_turned_and_found_is_cut_where_it_lies_and_known_again(
 
     # What the beam did, seen from the sheet as it truly lay, is the design.
     burnt = strokes(bench.trace())
-    cuts = on_sheet(burnt[(burnt[:, 5] > before_s) & (burnt[:, 4] > 0.008)], sheet)[:, :4].reshape(-1, 2, 2)
+    long = np.hypot(*(burnt[:, 2:4] - burnt[:, :2]).T) > 0.02  # where the tag's strokes turn, some micrometres are hot
+    burnt = burnt[(burnt[:, 5] > before_s) & (burnt[:, 4] > 0.008) & long]
+    cuts = on_sheet(burnt, sheet)[:, :4].reshape(-1, 2, 2)
     design_mm = MultiLineString([(np.array(ends) + AT_MM).tolist() for ends in SLITS])
     assert distance(points(cuts.reshape(-1, 2)), design_mm).max() < 0.15
     assert np.linalg.norm(cuts[:, 1] - cuts[:, 0], axis=1).sum() == pytest.approx(design_mm.length, rel=0.05)
