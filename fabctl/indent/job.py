@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from design.findings import Finding, errors
+from drivers.clock import Clock, WallClock
 from drivers.errors import DeviceError
 from drivers.rig.indenter import Identity, open_indenter
 from drivers.rig.registers import RegisterMap
 from fabctl.bench import Bench, refuse_without
-from fabctl.clock import Clock, WallClock
 from fabctl.config.bench import BenchConfig, RigConfig, find
 from fabctl.config.method import MethodConfig, load_method
 from fabctl.config.rig import load_rig
