@@ -7,8 +7,9 @@ from typing import Any, cast
 
 import click
 
-from fabctl.cli.common import json_option, lab, progress, say, show
+from fabctl.cli.common import MATERIAL, json_option, lab, progress, say, show
 from fabctl.cli.finite import numbers
+from fabctl.cli.paths import SPECIMEN, TARGET, InFile, InFolder, OutFolder, PictureFile, config_names
 from fabctl.events import Event
 
 
@@ -18,10 +19,10 @@ def command() -> None:
 
 
 @command.command()
-@click.argument("spec")
-@click.option("--target", type=click.Path(path_type=Path), help="Mesh to use instead of the specification's.")
+@click.argument("spec", type=config_names("specs"))
+@click.option("--target", type=InFile(), help="Mesh to use instead of the specification's.")
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell, instead of the specification's.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Design folder to write [out/NAME].")
+@click.option("-o", "--output", type=OutFolder(), help="Design folder to write [out/NAME].")
 @click.option("--replace", is_flag=True, help="Replace a design that lies in that folder.")
 @click.option("--compensate", is_flag=True, help="Change the expansions so that the bent sheet meets the target.")
 @json_option
@@ -62,19 +63,31 @@ def build(
 
 
 @command.command()
-@click.argument("target")
-@click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
+@click.argument("target", type=TARGET)
+@click.option(
+    "--material", type=MATERIAL, help="Material file or its name, for a mesh or surface [natural-rubber-2.3]."
+)
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell [the material's].")
-@click.option("--cells", type=click.Choice(["expanding", "contracting"]), default="expanding", show_default=True,
-              help="Kind of cells, where TARGET is no specification.")  # fmt: skip
+@click.option("--cells", type=click.Choice(["expanding", "contracting"]),
+              help="Kind of cells, for a mesh or surface [expanding].")  # fmt: skip
 @click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]), default="none", show_default=True,
               help="What to try where no single sheet fits.")  # fmt: skip
-@click.option("--picture", type=click.Path(path_type=Path), help="PNG of where the surface does not fit.")
+@click.option("--picture", type=PictureFile((".png",)), help="PNG of where the surface does not fit.")
 @json_option
 def check(
-    target: str, material: str, cell_mm: float | None, cells: str, remedy: str, picture: Path | None, as_json: bool
+    target: str,
+    material: str | None,
+    cell_mm: float | None,
+    cells: str | None,
+    remedy: str,
+    picture: Path | None,
+    as_json: bool,
 ) -> None:
-    """Say whether a sheet can become TARGET: a mesh file, a specification, or one of the project's own surfaces."""
+    """Say whether a sheet can become TARGET: a specification, a mesh file, or one of the project's own surfaces.
+
+    A name that is a specification and a surface, such as cap, is the specification, as for `fabctl design build`;
+    with --material or --cells it is the surface.
+    """
     from design.checking import check as checked
     from design.checking import misfit_png
     from fabctl.designing import inputs_for
@@ -112,8 +125,8 @@ def check(
 
 
 @command.command()
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
+@click.argument("a", type=InFolder())
+@click.argument("b", type=InFolder())
 @json_option
 def compare(a: Path, b: Path, as_json: bool) -> None:
     """Compare two design folders: sheet, cells, cutting, deployed shape and stiffness."""
@@ -131,8 +144,10 @@ def compare(a: Path, b: Path, as_json: bool) -> None:
 @command.command()
 @click.option("--expansion", "expansion_ratio", type=float, default=1.5, show_default=True, help="Of the cell to try.")
 @click.option("--hinges-mm", default="0.20,0.25,0.30,0.35,0.40,0.45", show_default=True, help="Ladder of hinge widths.")
-@click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="New folder for the coupon.")
+@click.option(
+    "--material", type=MATERIAL, default="natural-rubber-2.3", show_default=True, help="Material file or its name."
+)
+@click.option("-o", "--output", type=OutFolder(), required=True, help="New folder for the coupon.")
 @json_option
 def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, as_json: bool) -> None:
     """Make a sheet of uniform patches, one a hinge width, to check the library on the real material."""
@@ -149,10 +164,10 @@ def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, 
 
 
 @command.command("coupon-read")
-@click.argument("form", type=click.Path(path_type=Path))
+@click.argument("form", type=click.Path(exists=True, path_type=Path))
 @click.option("--length-error-mm", type=click.FloatRange(min=0), default=0.2, show_default=True,
               help="Standard error of one reading of a length.")  # fmt: skip
-@click.option("--specimen", help="Specimen whose record is told where this coupon's result lies.")
+@click.option("--specimen", type=SPECIMEN, help="Specimen whose record is told where this coupon's result lies.")
 @json_option
 def coupon_read(form: Path, length_error_mm: float, specimen: str | None, as_json: bool) -> None:
     """Read a coupon's filled FORM (coupon.csv, or its folder): measured expansions against the map."""
