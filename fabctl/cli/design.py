@@ -107,8 +107,8 @@ def check(
         lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
-    show({"target": target, "fits": fits, **found.as_dict()}, as_json, lines)
-    raise click.exceptions.Exit(DONE if fits else REFUSED)
+    facts = {"target": target, "fits": fits, **found.as_dict()}
+    show(facts, as_json, lines, DONE if fits else REFUSED, f"{target}: no single sheet fits it as it is")
 
 
 @command.command()
