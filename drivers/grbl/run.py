@@ -185,7 +185,9 @@ def run_program(laser: Laser, lines: Sequence[str], watcher: Watcher) -> Progres
         while not run.stream.done:
             run.step()
         stood_s = _await_standstill(run)
-    except BaseException:  # Ctrl-C too: the beam is off on every way out
+    except BaseException:
+        # KeyboardInterrupt too, which is no Exception. A second Ctrl-C cuts the waiting in `off` short, and one that
+        # breaks out of it meets `off` again on leaving the laser's `with` block.
         laser.off()
         raise
     laser.end()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -40,7 +41,8 @@ BOARD = Identity(
 LASER = LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0))
 IDLE = Report("Idle", machine_mm=(-1.0, -1.0, -1.0))
 GOOD = ("G21", "G90", "M8", "M4S0", "G0X-200Y-100F1500S500", "G1X-190", "G0X-200Y-90", "G1X-190", "M5", "M9", "G4P0.01")
-DYNAMICS = Dynamics.of(BOARD.settings)
+DYNAMICS = Dynamics.of(BOARD.settings | {1: 255.0})
+LOCKING = Dynamics.of(BOARD.settings)
 
 
 def with_settings(**changes: float) -> Identity:
@@ -202,6 +204,30 @@ def test_a_single_move_takes_the_time_of_its_trapezoid() -> None:
     program = read_program(("G21", "G90", "M4S0", "G1X50F1500S5"))
     v, a = 25.0, 500.0
     assert estimate(program.steps[1:], DYNAMICS).total_s == pytest.approx(50 / v + v / a)
+
+
+def test_every_standstill_lasts_until_the_steppers_have_settled() -> None:
+    twice = read_program(("G1X10F1500S5", "M4S0", "M8", "G1X20", "M5", "M9"))
+    free_s, locked_s = (estimate(twice.steps, dynamics).total_s for dynamics in (DYNAMICS, LOCKING))
+    assert locked_s - free_s == pytest.approx(2 * 0.025)
+    assert Dynamics.of({1: 25.0}, firmware="FluidNC").lock_s == 0.0
+
+
+def test_words_that_change_nothing_wait_for_nothing() -> None:
+    lines = ("G1X10F1500S5", "M4S5", "M8", "G1X20S5")
+    again = (*lines[:3], "M4", "M8", "S5", "G1X20S5")
+    assert [step.sync for step in read_program(again).steps] == [step.sync for step in read_program(lines).steps]
+    louder = read_program(("M4S5", "G1X10F1500", "S6", "G1X20S7"))
+    assert [step.sync for step in louder.steps] == [True, False, True, False]
+
+
+def test_the_estimate_is_that_of_a_recorded_board(shared: Path) -> None:
+    path = shared / "laser" / "grbl-1.1h-dialogues" / "motion.jsonl"
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    first, last = (next(k for k, r in enumerate(rows) if r["bytes"] == text) for text in ("G0X5Y5\n", "M5\n"))
+    sent = [r["bytes"] for r in rows[first : last + 1] if r["dir"] == ">" and r["bytes"] != "?"]
+    took_s = rows[last + 1]["t_s"] - rows[first]["t_s"] - 0.010  # the recorder looked every 20 ms
+    assert estimate(read_program(sent).steps, LOCKING).total_s == pytest.approx(took_s, rel=0.006)
 
 
 def test_a_corner_costs_time_and_a_straight_joint_none() -> None:
