@@ -8,7 +8,7 @@ from typing import Any, cast
 import click
 
 from fabctl.cli.common import json_option, lab, progress, say, show
-from fabctl.cli.design_coupon import coupon, coupon_read
+from fabctl.cli.design_coupon import coupon, coupon_read, library_option
 from fabctl.events import Event
 
 
@@ -25,6 +25,7 @@ command.add_command(coupon_read)
 @click.argument("spec")
 @click.option("--target", type=click.Path(path_type=Path), help="Mesh to use instead of the specification's.")
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell, instead of the specification's.")
+@library_option
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Design folder to write [out/NAME].")
 @click.option("--replace", is_flag=True, help="Replace a design that lies in that folder.")
 @click.option("--compensate", is_flag=True, help="Change the expansions so that the bent sheet meets the target.")
@@ -33,6 +34,7 @@ def build(
     spec: str,
     target: Path | None,
     cell_mm: float | None,
+    library: Path | None,
     output: Path | None,
     replace: bool,
     compensate: bool,
@@ -45,7 +47,7 @@ def build(
 
     home = lab().root
     folder = output or home / "out" / load_spec(spec, home)[0].name
-    design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress(), compensate)
+    design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress(), compensate, library)
     for finding in design.findings:
         say(str(finding))
     numbers = facts(design)
@@ -69,6 +71,7 @@ def build(
 @click.argument("target")
 @click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell [the material's].")
+@library_option
 @click.option("--cells", type=click.Choice(["expanding", "contracting"]), default="expanding", show_default=True,
               help="Kind of cells, where TARGET is no specification.")  # fmt: skip
 @click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]), default="none", show_default=True,
@@ -76,7 +79,14 @@ def build(
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG of where the surface does not fit.")
 @json_option
 def check(
-    target: str, material: str, cell_mm: float | None, cells: str, remedy: str, picture: Path | None, as_json: bool
+    target: str,
+    material: str,
+    cell_mm: float | None,
+    library: Path | None,
+    cells: str,
+    remedy: str,
+    picture: Path | None,
+    as_json: bool,
 ) -> None:
     """Say whether a sheet can become TARGET: a mesh file, a specification, or one of the project's own surfaces."""
     from design.checking import check as checked
@@ -85,7 +95,7 @@ def check(
     from fabctl.errors import DONE, REFUSED
 
     listen = progress()
-    inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells))
+    inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
 
     def watch(message: str, done_frac: float) -> None:
         listen(Event("progress", message, done_frac))

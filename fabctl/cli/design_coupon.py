@@ -14,15 +14,22 @@ from fabctl.cli.finite import numbers
 if TYPE_CHECKING:
     from fabctl.coupon import Measured
 
+library_option = click.option(
+    "--library", type=click.Path(path_type=Path), help="Library of cells (.npz), or a published map (.csv)."
+)
+
 
 @click.command()
 @click.option("--expansion", "expansion_ratio", type=click.FloatRange(1, min_open=True), default=1.5,
               show_default=True, help="Of the cell to try.")  # fmt: skip
 @click.option("--hinges-mm", default="0.20,0.25,0.30,0.35,0.40,0.45", show_default=True, help="Ladder of hinge widths.")
 @click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
+@library_option
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="New folder for the coupon.")
 @json_option
-def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, as_json: bool) -> None:
+def coupon(
+    expansion_ratio: float, hinges_mm: str, material: str, library: Path | None, output: Path, as_json: bool
+) -> None:
     """Make a sheet of uniform patches, one a hinge width, to check the library on the real material.
 
     The folder is cut as a design's is (`fabctl cut run`). Lengths are measured from a notch of a patch's left border
@@ -34,7 +41,8 @@ def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, 
     hinges = tuple(numbers(hinges_mm, "--hinges-mm"))
     if min(hinges) <= 0:
         raise click.UsageError("--hinges-mm takes widths above zero")
-    asked = CouponConfig(material=material, expansion_ratio=expansion_ratio, hinges_mm=hinges)
+    chosen_from = None if library is None else str(library.resolve())
+    asked = CouponConfig(material=material, expansion_ratio=expansion_ratio, hinges_mm=hinges, library=chosen_from)
     made, bundle = write_coupon(output, asked, lab().root)
     width, height = made.drawing.size_mm
     lines = [f"{output}: {len(made.patches)} patches on {width:.0f} × {height:.0f} mm"]
