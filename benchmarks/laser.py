@@ -1,7 +1,8 @@
-"""The laser room's figures: `python -m benchmarks laser [--url URL] [--quick]`.
+"""The laser room's figures: `python -m benchmarks laser [--url URL [--allow-motion]] [--quick]`.
 
-Without `--url`, on the simulated board in virtual time, which makes every figure repeatable. With `--url`, those that
-need no motion are measured on whatever answers there.
+Without `--url`, on the simulated board in virtual time, which makes every figure repeatable; the recorded dialogues are
+looked for beside the project or in `FABCTL_SHARED`. With `--url`, lines/s and reaction times are measured on whatever
+answers there, and with `--allow-motion` (at most 5 mm, beam off) the estimate of a small job too.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ import time
 from pathlib import Path
 
 from benchmarks import Figure
+from benchmarks._laser_dialogues import differences, rows_of
+from benchmarks._laser_endpoint import motion, reactions, ready
 from benchmarks._laser_jobs import JOBS, burnt_against, dense_job
 from benchmarks._laser_kills import KILLS, RUN_ON_S, killed_run, missing_count, resumed, twice_mm
 from benchmarks._laser_kills import PROGRAM as KILL_PROGRAM
@@ -45,6 +48,7 @@ EXPECTED: dict[str, type[Exception] | None] = {
     "banner": BoardRestarted,
     "unplug": TransportError,
     "stall": LinkStalled,
+    "slow": None,
 }
 
 
@@ -53,8 +57,10 @@ def measure(words: list[str]) -> list[Figure]:
     quick = "--quick" in words
     url = words[words.index("--url") + 1] if "--url" in words else None
     if url is not None:
-        return [*throughput(url, 5_000 if quick else 100_000), reaction(url)]
+        there = [*throughput(url, 5_000 if quick else 100_000), *reactions(url)]
+        return [*there, *motion(url)] if "--allow-motion" in words else there
     return [
+        dialogues(),
         *throughput(None, 5_000 if quick else 100_000),
         pacer(),
         *burn(),
@@ -62,32 +68,42 @@ def measure(words: list[str]) -> list[Figure]:
         slow_move(),
         *pin(),
         *kills(10 if quick else len(KILLS)),
+        *short_slits(2 if quick else 9),
         *estimates(),
     ]
 
 
-def nine_bytes(count: int) -> list[str]:
-    """Return lines that are 9.3 bytes long on average, newline included."""
-    return [
-        "G21G90",
-        "G1F1000",
-        *(f"X{k % 90 + 10}.5Y{k % 70 + 10}" + (".5" if k % 20 < 3 else "") for k in range(count)),
-    ]
+def dialogues() -> Figure:
+    """Replay the recorded dialogues against the simulated board."""
+    folder = Path(os.environ.get("FABCTL_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+    paths = sorted((folder / "laser" / "grbl-1.1h-dialogues").glob("*.jsonl"))
+    same = sum(not differences(rows_of(path)) for path in paths)
+    asked = "all, to the byte but for status numbers" if paths else "not measured: no recordings here"
+    met = same == len(paths) if paths else None
+    return Figure("recorded dialogues answered alike", f"{same}/{len(paths)}", "", asked, met, len(paths))
+
+
+def nine_bytes(count: int, positive: bool = False) -> list[str]:
+    """Return lines that are 9.3 bytes long on average, newline included, within 100 × 80 mm of the travel.
+
+    Check mode obeys soft limits: machine space is negative, or positive where the firmware homes to zero.
+    """
+    x, y = ("X{}.5", "Y{}") if positive else ("X-{}", "Y-{}")
+    moves = (x.format(k % 90 + 10) + y.format(k % 70 + 10) + (".5" if k % 20 < 3 else "") for k in range(count))
+    return ["G21G90", "G1F1000", *moves]
 
 
 def throughput(url: str | None, count: int) -> list[Figure]:
     """Measure check-mode lines per second on a paced line, against the wire's own limit for these lines."""
-    lines = nine_bytes(count)
-    mean_bytes = sum(len(line) + 1 for line in lines) / len(lines)
     with tempfile.TemporaryDirectory() as folder:
         process, address = (None, url) if url else start_board(Path(folder) / "port")
         try:
             with Laser(open_transport(str(address))) as laser:
-                laser.connect()
-                if laser.report().state == "Alarm":
-                    laser.unlock()
+                identity = ready(laser).identity
+                assert identity is not None
+                lines = nine_bytes(count, identity.homes_to_zero)
                 began_s = time.perf_counter()
-                refused = check_program(laser.link, lines, laser.identity.rx_bytes if laser.identity else 128)
+                refused = check_program(laser.link, lines, identity.rx_bytes)
                 took_s = time.perf_counter() - began_s
                 laser.end()
         finally:
@@ -95,6 +111,7 @@ def throughput(url: str | None, count: int) -> list[Figure]:
                 process.terminate()
                 process.wait()
     rate = len(lines) / took_s
+    mean_bytes = sum(len(line) + 1 for line in lines) / len(lines)
     wire = 11_520 / mean_bytes
     return [
         Figure(f"check-mode throughput, {mean_bytes:.1f} B lines", round(rate), "lines/s",
@@ -168,8 +185,9 @@ def faults(seeds_count: int) -> list[Figure]:
                 )
             )
             caught: type[Exception] | None = None
+            watch = Watch(since_s=lambda rig=rig: _done_s(rig))  # type: ignore[misc]
             try:
-                run_program(laser, program, Watch())
+                run_program(laser, program, watch)
             except DeviceError as fault:
                 caught = type(fault)
             total += 1
@@ -177,13 +195,20 @@ def faults(seeds_count: int) -> list[Figure]:
             sent = re.sub(rb"[?!~\x18\x80-\xff]", b"", bytes(rig.sent)).decode().split("\n")
             lines = [line for line in sent if line and line[0] != "$"]
             resent += lines != program[: len(lines)]
-            if rig.fault is not None and rig.fault.done_s is not None and kind in ("corrupt", "banner", "stall"):
-                slowest_s = max(slowest_s, stops[0] - rig.fault.done_s)
+            if expected is not None:
+                # a lost answer shows at standstill only, a doubled one there at the latest
+                evidence_s = watch.idle_s if kind in ("lost-ok", "double-ok") else _done_s(rig)
+                acted_s = stops[0] if stops else rig.clock.now_s()
+                slowest_s = max(slowest_s, acted_s - (evidence_s or acted_s))
     return [
         Figure("faults classified rightly", f"{right}/{total}", "", "each × 20 seeds, all", right == total, total),
         Figure("slowest reaction to the evidence", round(slowest_s, 3), "s", "within 1 s", slowest_s < 1.0, total),
         Figure("runs in which a line was sent twice or out of order", resent, "", "never", resent == 0, total),
     ]
+
+
+def _done_s(rig: Rig) -> float:
+    return math.inf if rig.fault is None or rig.fault.done_s is None else rig.fault.done_s
 
 
 def slow_move() -> Figure:
@@ -266,6 +291,22 @@ def kills(count: int) -> list[Figure]:
     ]  # fmt: skip
 
 
+def short_slits(count: int) -> list[Figure]:
+    """Kill cuts of slits shorter than two status reports, the position lost."""
+    found = []
+    for length_mm in (1.0, 2.0):
+        program = read_program(slits(30, length_mm=length_mm))
+        worst_mm, missing = 0.0, 0
+        for seed in range(count):
+            rig, rows, died_s = killed_run(seed, program, absence_s=(0.0, 0.4, 8.0)[seed % 3])
+            resumed(rig, rows, program, died_s, restart=True)
+            worst_mm, missing = max(worst_mm, twice_mm(rig, program)), missing + missing_count(rig, program)
+        name = f"burnt twice per kill, position lost, slits of {length_mm:g} mm"
+        met = worst_mm <= length_mm and missing == 0
+        found.append(Figure(name, round(worst_mm, 2), "mm", f"<= one slit ({length_mm:g} mm)", met, count))
+    return found
+
+
 def estimates() -> list[Figure]:
     """Compare the estimated time of eleven jobs, run as a cut runs them, with the simulated board's own.
 
@@ -292,15 +333,3 @@ def estimates() -> list[Figure]:
                "within 2 %", abs(worst) <= 0.02, len(errors)),
         Figure("host before and after a job, the board standing", round(listened_s, 2), "s", "", None, len(errors)),
     ]  # fmt: skip
-
-
-def reaction(url: str) -> Figure:
-    """Measure how long a status question takes to be answered."""
-    with Laser(open_transport(url)) as laser:
-        laser.connect()
-        times = []
-        for _ in range(50):
-            began_s = time.perf_counter()
-            laser.report()
-            times.append(time.perf_counter() - began_s)
-    return Figure("answer to a status question", round(1000 * sorted(times)[len(times) // 2], 1), "ms", "", None, 50)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks._laser_dialogues import alike, board_time, replay, rows_of
 from simulators.grbl.board import Board
 from simulators.grbl.machine import State
 from tests.simulators.test_grbl_board import board, say
-from tests.simulators.test_grbl_dialogues import alike, board_time, replay, rows_of
 
 STANDS_S = 10 / 25 + 25 / 500  # ten millimetres at F1500 and 500 mm/s²
 
