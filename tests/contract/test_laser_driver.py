@@ -148,6 +148,25 @@ def test_a_second_interrupt_resets_at_once() -> None:
     assert rig.board.machine.pin.power_frac == 0
 
 
+@pytest.mark.parametrize("button", [b"!", b"\x84"])
+def test_a_board_paused_by_its_own_button_or_door_is_resumed_too(button: bytes) -> None:
+    rig = Rig()
+    laser = connected(rig)
+    now_s = rig.clock.now_s()
+    watch = Watch([(now_s + 2.0, "resume")], rig.clock)
+    pressed: list[float] = []
+
+    def press(_: bytes) -> None:
+        if not pressed and rig.clock.now_s() > now_s + 0.6:
+            pressed.append(rig.clock.now_s())
+            rig.board.receive(button)
+
+    rig.before_send = press
+    done = run_program(laser, slits(6), watch)
+    assert done.answered_count == len(slits(6))
+    assert {p.report.state for p in watch.reports if p.report is not None} & {"Hold", "Door"}
+
+
 def test_homing_makes_the_position_known() -> None:
     rig = Rig(homed=False)
     laser = connected(rig)
