@@ -82,6 +82,14 @@ def test_a_cancelled_jog_returns_to_idle_with_nothing_left() -> None:
     assert b.machine.position_mm() == place
 
 
+@pytest.mark.parametrize("pause", [b"!", b"\x84"])
+def test_lines_that_came_during_a_hold_are_answered_when_it_ends(pause: bytes) -> None:
+    b = board()
+    say(b, pause, 0.05)
+    assert say(b, b"G21\nG90\n", 0.2) == ""
+    assert say(b, b"~", 0.2) == "ok\r\nok\r\n"
+
+
 @pytest.mark.parametrize("place", ["10.1", "0.7", "33.3", "-7.9"])
 def test_zero_is_shown_without_a_sign_as_single_precision_finds_it(place: str) -> None:
     b = board(_10=0)
