@@ -20,7 +20,7 @@ from pathlib import Path
 from benchmarks import Figure
 from benchmarks._laser_dialogues import differences, rows_of
 from benchmarks._laser_endpoint import motion, reactions, ready
-from benchmarks._laser_jobs import JOBS, burnt_against, dense_job
+from benchmarks._laser_jobs import JOBS, burnt_against, timed_jobs
 from benchmarks._laser_kills import KILLS, RUN_ON_S, killed_run, missing_count, resumed, twice_mm
 from benchmarks._laser_kills import PROGRAM as KILL_PROGRAM
 from benchmarks._laser_rig import Rig, Watch, lit_while_standing, slits
@@ -308,14 +308,14 @@ def short_slits(count: int) -> list[Figure]:
 
 
 def estimates() -> list[Figure]:
-    """Compare the estimated time of eleven jobs, run as a cut runs them, with the simulated board's own.
+    """Compare the estimated time of twelve jobs, run as a cut runs them, with the simulated board's own.
 
     Both count from the first line until the board is seen standing at the end, as a cut's record does. What the host
     listens on after that, with the board standing, is told beside it.
     """
     errors: list[tuple[float, str]] = []
     listened_s = 0.0
-    for name, lines in {**JOBS, "dense": dense_job()}.items():
+    for name, lines in timed_jobs().items():
         rig = Rig()
         rig.board.trace = None
         laser = rig.laser()

@@ -250,6 +250,15 @@ def test_more_steps_never_make_a_smooth_path_faster() -> None:
     assert circle(4000) > circle(400)  # fifteen moves of 0.03 mm leave no room to brake from full speed
 
 
+def test_no_piece_is_faster_than_the_moves_behind_it_can_brake_from() -> None:
+    count, piece_mm = 3000, 0.1
+    program = read_program([f"G1X{piece_mm * (k + 1):.4f}F6000S5" for k in range(count)])
+    took_s = estimate(program.steps, DYNAMICS).total_s
+    cruise_mm_s = math.sqrt(2 * 500 * 14 * piece_mm)  # fifteen moves, of which one is being made
+    piece_s = 2 * (math.sqrt(cruise_mm_s**2 + 500 * piece_mm) - cruise_mm_s) / 500  # in which it goes up and down again
+    assert took_s == pytest.approx(count * piece_s + cruise_mm_s / 500, rel=0.001)
+
+
 def test_a_pause_is_rounded_up_to_the_board_s_steps() -> None:
     program = read_program(("G4P0.01", "G4P0.06"))
     assert estimate(program.steps, DYNAMICS).total_s == pytest.approx(0.05 + 0.1, abs=0.02)
