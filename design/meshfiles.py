@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +74,7 @@ def _read_soup(path: Path) -> Soup:
 
 def _or_raise(path: Path, found: list[Finding]) -> list[Finding]:
     """Return the findings where none forbids going on."""
-    found = [Finding(f.code, f.message, f.level, f.where or path.name, f.hint) for f in found]
+    found = [replace(f, where=f.where or path.name) for f in found]
     wrong = errors(found)
     if not wrong:
         return found

@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import dataclass
 from dataclasses import replace as changed
 from pathlib import Path
 
 import numpy as np
+import yaml
 
-from design.bundle import Bundle, write_bundle
+from design.bundle import Bundle, write_bundle, write_coupon_bundle
 from design.cells.contracting import load_contracting
 from design.cells.library import CellLibrary, load_library
 from design.cells.select import select
 from design.cells.sheet import Sheet
-from design.compared import Patch, coupon, coupon_csv
-from design.export.dxf import dxf
-from design.export.svg import svg
+from design.coupon import Coupon, coupon
+from design.export.gcode import GcodeOptions
 from design.findings import Finding
 from design.job import JobOptions, compose_job
 from design.meshfiles import read_mesh
-from design.pattern.drawing import as_json
 from design.pattern.paths import Layer, LayerPreset
 from design.pattern.toolpath import ToolOptions
 from design.pipeline import Design, build
 from design.spec import DesignSpec, Kind
 from design.surface import TriMesh
 from design.targets import TARGETS
+from fabctl.config.coupon import CouponConfig
 from fabctl.config.material import LayerConfig, MaterialConfig, load_material
-from fabctl.config.spec import MadeTarget, SpecConfig, load_spec
+from fabctl.config.spec import MadeTarget, SpecConfig, ToolConfig, load_spec
 from fabctl.errors import RefusedError, UsageError
 from fabctl.events import Emit, Event, silent
 
@@ -186,24 +185,21 @@ def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
     return {layer: LayerPreset(c.power_frac, c.feed_mm_s, c.passes_count) for layer, c in layers.items()}
 
 
-def write_coupon(
-    folder: Path, expansion_ratio: float, hinges_mm: list[float], material_name: str, home: Path
-) -> list[Patch]:
-    """Write a coupon's drawing, program and form into a new folder; return its patches."""
-    material = load_material(material_name, home)
+def write_coupon(folder: Path, asked: CouponConfig, home: Path) -> tuple[Coupon, Bundle]:
+    """Write a coupon's folder, which is cut as a design's is; return what is drawn, and the folder."""
+    material = load_material(asked.material, home)
     presets = presets_of(material)
     assert material.laser is not None
     sheet = sheet_of(material, material.edge_mm)
-    cell = select(load_library().scaled(sheet), np.array([expansion_ratio]))
-    drawing, patches = coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), hinges_mm, sheet)
-    job = compose_job(drawing, presets, JobOptions(tool=ToolOptions(kerf_mm=material.laser.kerf_mm)))
-    try:
-        folder.mkdir(parents=True)
-    except FileExistsError:
-        raise UsageError(f"{folder}: exists already; choose another folder") from None
-    (folder / "cut.dxf").write_text(dxf(drawing.paths, drawing.size_mm), encoding="utf-8")
-    (folder / "cut.svg").write_text(svg(drawing.paths, drawing.size_mm, "coupon"), encoding="utf-8")
-    (folder / "cut.nc").write_text("\n".join(job.lines) + "\n", encoding="utf-8")
-    (folder / "paths.json").write_text(json.dumps(as_json(drawing)) + "\n", encoding="utf-8")
-    (folder / "coupon.csv").write_text(coupon_csv(patches), encoding="utf-8")
-    return patches
+    library = load_library(Path(asked.library) if asked.library else None).scaled(sheet)
+    cell = select(library, np.array([asked.expansion_ratio]))
+    made = coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), asked.hinges_mm, sheet)
+    job = compose_job(made.drawing, presets, job_options(asked.tool, material.laser.kerf_mm), remarks=[asked.name])
+    text = yaml.safe_dump(asked.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
+    return made, write_coupon_bundle(made, job, text, library.hash, sheet.edge_mm, folder)
+
+
+def job_options(tool: ToolConfig, kerf_mm: float, machine: GcodeOptions | None = None) -> JobOptions:
+    """Return how a drawing is cut with a specification's tool; the material's kerf unless it names its own."""
+    rest = tool.model_dump(exclude={"kerf_mm", "spread_mm"})
+    return JobOptions(ToolOptions(kerf_mm=tool.kerf_mm or kerf_mm, **rest), machine or GcodeOptions(), tool.spread_mm)
