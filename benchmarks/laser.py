@@ -1,4 +1,4 @@
-"""The laser room's figures: `python -m benchmarks laser [--url URL [--allow-motion]] [--quick]`.
+"""The laser room's figures: `python -m benchmarks laser [PART…] [--url URL [--allow-motion]] [--quick]`.
 
 Without `--url`, on the simulated board in virtual time, which makes every figure repeatable; the recorded dialogues are
 looked for beside the project or in `FABCTL_SHARED`. With `--url`, lines/s and reaction times are measured on whatever
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import Figure
@@ -59,28 +60,29 @@ def measure(words: list[str]) -> list[Figure]:
     if url is not None:
         there = [*throughput(url, 5_000 if quick else 100_000), *reactions(url)]
         return [*there, *motion(url)] if "--allow-motion" in words else there
-    return [
-        dialogues(),
-        *throughput(None, 5_000 if quick else 100_000),
-        pacer(),
-        *burn(),
-        *faults(4 if quick else SEEDS_COUNT),
-        slow_move(),
-        *pin(),
-        *kills(10 if quick else len(KILLS)),
-        *short_slits(2 if quick else 9),
-        *estimates(),
-    ]
+    parts: dict[str, Callable[[], list[Figure]]] = {
+        "dialogues": dialogues,
+        "throughput": lambda: throughput(None, 5_000 if quick else 100_000),
+        "pacer": pacer,
+        "burn": burn,
+        "faults": lambda: faults(4 if quick else SEEDS_COUNT),
+        "slow-move": slow_move,
+        "pin": pin,
+        "kills": lambda: [*kills(10 if quick else len(KILLS)), *short_slits(2 if quick else 9)],
+        "estimates": estimates,
+    }
+    chosen = [name for name in parts if name in words] or list(parts)
+    return [figure for name in chosen for figure in parts[name]()]
 
 
-def dialogues() -> Figure:
+def dialogues() -> list[Figure]:
     """Replay the recorded dialogues against the simulated board."""
     folder = Path(os.environ.get("FABCTL_SHARED", Path(__file__).resolve().parents[2] / "shared"))
     paths = sorted((folder / "laser" / "grbl-1.1h-dialogues").glob("*.jsonl"))
     same = sum(not differences(rows_of(path)) for path in paths)
     asked = "all, to the byte but for status numbers" if paths else "not measured: no recordings here"
     met = same == len(paths) if paths else None
-    return Figure("recorded dialogues answered alike", f"{same}/{len(paths)}", "", asked, met, len(paths))
+    return [Figure("recorded dialogues answered alike", f"{same}/{len(paths)}", "", asked, met, len(paths))]
 
 
 def nine_bytes(count: int, positive: bool = False) -> list[str]:
@@ -128,7 +130,7 @@ def start_board(port: Path, *more: str) -> tuple[subprocess.Popen[str], str]:
     return process, process.stdout.readline().split()[1]
 
 
-def pacer() -> Figure:
+def pacer() -> list[Figure]:
     """Measure the fastest second of the simulated line, host to board, in virtual time."""
     rig = Rig()
     arrivals: list[float] = []
@@ -144,9 +146,11 @@ def pacer() -> Figure:
     worst = max((k + 11_520 for k in range(0, len(arrivals) - 11_520, 97)), default=0)
     fastest = min((arrivals[k] - arrivals[k - 11_520] for k in range(11_520, worst)), default=math.inf)
     rate = 11_520 / fastest
-    return Figure(
-        "the pacer's fastest second", round(rate, 1), "B/s", "never above 11,520", rate <= 11_520.5, len(arrivals)
-    )
+    return [
+        Figure(
+            "the pacer's fastest second", round(rate, 1), "B/s", "never above 11,520", rate <= 11_520.5, len(arrivals)
+        )
+    ]
 
 
 def burn() -> list[Figure]:
@@ -211,7 +215,7 @@ def _done_s(rig: Rig) -> float:
     return math.inf if rig.fault is None or rig.fault.done_s is None else rig.fault.done_s
 
 
-def slow_move() -> Figure:
+def slow_move() -> list[Figure]:
     """Run a single move of 60 s and see that nobody takes it for a stall."""
     rig = Rig()
     laser = rig.laser()
@@ -223,9 +227,11 @@ def slow_move() -> Figure:
     except DeviceError:
         healthy = False
     took_s = rig.clock.now_s() - begun_s
-    return Figure(
-        "a healthy move of 60 s runs through", round(took_s, 1), "s", "never aborted", healthy and took_s > 60, 1
-    )
+    return [
+        Figure(
+            "a healthy move of 60 s runs through", round(took_s, 1), "s", "never aborted", healthy and took_s > 60, 1
+        )
+    ]
 
 
 def pin() -> list[Figure]:
