@@ -15,6 +15,7 @@ NUMBERS = re.compile(r"(MPos|WPos|FS):[-0-9.,]+")
 POSITION = re.compile(r"MPos:(-?[0-9.]+),(-?[0-9.]+)")
 FEED = re.compile(r"FS:([0-9.]+),")
 TRANSITION_S = 0.050
+LOOKED_S = 0.020  # the recorder looked for answers so often
 NAMES = (
     "check-mode",
     "error-while-streaming",
@@ -94,6 +95,14 @@ def replay(rows: list[Row], times: list[float], shift_s: float = 0.0) -> list[st
     board.advance_to(times[-1] + 1.0)
     out += board.take()
     return out.decode("latin-1").split("\r\n")
+
+
+def recorded_job(path: Path) -> tuple[list[str], float]:
+    """Return the moves of the recorded `motion` dialogue, and how long they took until the board stood."""
+    rows = rows_of(path)
+    first, last = (next(k for k, row in enumerate(rows) if row.data == data) for data in (b"G0X5Y5\n", b"M5\n"))
+    sent = [row.data.decode("ascii") for row in rows[first : last + 1] if row.sent and row.data != b"?"]
+    return sent, rows[last + 1].t_s - rows[first].t_s - LOOKED_S / 2
 
 
 def alike(recorded: str, simulated: str) -> bool:

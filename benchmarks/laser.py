@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import Figure
-from benchmarks._laser_dialogues import differences, rows_of
+from benchmarks._laser_dialogues import differences, recorded_job, rows_of
 from benchmarks._laser_endpoint import motion, reactions, ready
 from benchmarks._laser_jobs import JOBS, burnt_against, timed_jobs
 from benchmarks._laser_kills import KILLS, RUN_ON_S, killed_run, missing_count, resumed, twice_mm
@@ -31,6 +31,7 @@ from drivers.grbl.faults import BoardRestarted, DoubledOk, GarbledLine, LinkStal
 from drivers.grbl.laser import Laser
 from drivers.grbl.run import StoppedByOperator, run_program
 from drivers.transport import open_transport
+from fabctl.cut.estimate import Dynamics, estimate
 from fabctl.cut.execute import run_plan
 from fabctl.cut.place import Affine
 from fabctl.cut.plan import CutPlan, program_times
@@ -82,7 +83,15 @@ def dialogues() -> list[Figure]:
     same = sum(not differences(rows_of(path)) for path in paths)
     asked = "all, to the byte but for status numbers" if paths else "not measured: no recordings here"
     met = same == len(paths) if paths else None
-    return [Figure("recorded dialogues answered alike", f"{same}/{len(paths)}", "", asked, met, len(paths))]
+    found = [Figure("recorded dialogues answered alike", f"{same}/{len(paths)}", "", asked, met, len(paths))]
+    motion_path = folder / "laser" / "grbl-1.1h-dialogues" / "motion.jsonl"
+    if motion_path.exists():
+        lines, took_s = recorded_job(motion_path)
+        board = Dynamics.of({1: 25, 100: 250, 101: 250, 110: 6000, 111: 6000, 120: 500, 121: 500})
+        error = estimate(read_program(lines).steps, board).total_s / took_s - 1
+        name = f"time estimate of the recorded job of {took_s:.2f} s"
+        found.append(Figure(name, round(100 * error, 1), "%", "within 2 %", abs(error) <= 0.02, 1))
+    return found
 
 
 def nine_bytes(count: int, positive: bool = False) -> list[str]:
