@@ -102,9 +102,10 @@ class _Run:
         if wish == "hold":
             self.held = True
             self.link.send(HOLD)
-        elif wish == "resume" and self.held:
+        elif wish == "resume":
             report = self.link.report
-            if report is not None and report.standing:
+            paused = self.held or (report is not None and report.state in ("Hold", "Door"))  # by its own button or door
+            if paused and report is not None and report.standing:
                 self.held = False
                 self.idle_since_s = None
                 self.link.send(START)

@@ -121,7 +121,7 @@ def _corner_sq(before: tuple[float, float], after: tuple[float, float], dynamics
 
 def _run(chain: list[_Block], dynamics: Dynamics, clock_s: float, ends: list[float]) -> float:
     """Set the end of every step of a chain that starts and ends at rest; return when it is over."""
-    entries = _entry_speeds_sq(chain, dynamics.planner_count)
+    entries = _entry_speeds_sq(chain, max(dynamics.planner_count - 1, 1))  # one of them is being made
     for block, entry_sq, exit_sq in zip(chain, entries[:-1], entries[1:], strict=True) if chain else ():
         clock_s += _time_s(block, entry_sq, exit_sq)
         ends[block.step] = clock_s

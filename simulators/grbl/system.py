@@ -66,7 +66,8 @@ def _main_loop(m: Machine) -> Program:
         yield from poll(m)
         if m.aborted():
             return
-        if not (m.planner.moves and m.state is State.IDLE):
+        unread = m.rx_free() < m.dialect.rx_bytes  # it came during a hold that has just ended
+        if not unread and not (m.planner.moves and m.state is State.IDLE):
             yield float("inf")
 
 

@@ -75,7 +75,8 @@ def cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cut:
     run.artefact("job.nc").write_text("\n".join(PROGRAM.lines) + "\n")
     (run.path / "wire.log").write_text("\n".join(rows) + "\n")
     run.finish("failed", "the host was killed")
-    config = SimpleNamespace(name="small", laser=LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0)))
+    laser = LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0))
+    config = SimpleNamespace(name="small", laser=laser, model_dump=lambda **_: {"name": "small"})
     order = CutOrder(design, lambda _, __: PROGRAM.lines, RUBBER)
 
     @contextmanager
@@ -210,3 +211,35 @@ def test_a_camera_is_of_no_use_to_a_machine_without_homing(
         found = [finding.code for finding in fault.findings]
     assert found == expected
     assert all(point.power_frac == 0 for point in rig.trace)
+
+
+@pytest.mark.parametrize("homing", [1, 0])
+def test_a_cut_without_homing_frames_first_so_that_its_zero_is_seen(
+    cut: Cut, homing: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig(settings={**LAB, 20: 0, 22: homing})
+
+    @contextmanager
+    def laser_on(_bench: Any, _log: Any = None) -> Iterator[Laser]:
+        with rig.laser() as laser:
+            laser.connect()
+            yield laser
+
+    monkeypatch.setattr(job, "laser_on", laser_on)
+    config = cut.bench.config
+    config.laser = config.laser.model_copy(update={"homing": bool(homing), "origin_mm": (300.0, 200.0)})
+    asked: list[str] = []
+
+    def answer(question: str) -> bool:
+        asked.append(question)
+        return "Does it fit" not in question
+
+    if homing:
+        assert job.cut(cut.lab, cut.bench, cut.order, Desk(answer, silent)).run is not None
+        assert len(asked) == 1
+        return
+    with pytest.raises(Stopped, match="frame"):
+        job.cut(cut.lab, cut.bench, cut.order, Desk(answer, silent))
+    assert ["frames the job first" in asked[0], "Does it fit" in asked[1]] == [True, True]
+    assert all(point.power_frac == 0 for point in rig.trace)
+    assert max(point.x_mm for point in rig.trace) - min(point.x_mm for point in rig.trace) > 20

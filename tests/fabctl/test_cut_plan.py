@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import replace
@@ -12,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks._laser_dialogues import recorded_job
 from drivers.grbl.messages import Report
 from drivers.grbl.settings import Identity, Settings
 from fabctl.config.bench import LaserConfig
@@ -222,11 +222,7 @@ def test_words_that_change_nothing_wait_for_nothing() -> None:
 
 
 def test_the_estimate_is_that_of_a_recorded_board(shared: Path) -> None:
-    path = shared / "laser" / "grbl-1.1h-dialogues" / "motion.jsonl"
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
-    first, last = (next(k for k, r in enumerate(rows) if r["bytes"] == text) for text in ("G0X5Y5\n", "M5\n"))
-    sent = [r["bytes"] for r in rows[first : last + 1] if r["dir"] == ">" and r["bytes"] != "?"]
-    took_s = rows[last + 1]["t_s"] - rows[first]["t_s"] - 0.010  # the recorder looked every 20 ms
+    sent, took_s = recorded_job(shared / "laser" / "grbl-1.1h-dialogues" / "motion.jsonl")
     assert estimate(read_program(sent).steps, LOCKING).total_s == pytest.approx(took_s, rel=0.006)
 
 
@@ -248,6 +244,15 @@ def test_more_steps_never_make_a_smooth_path_faster() -> None:
         return estimate(read_program(lines).steps, DYNAMICS).total_s
 
     assert circle(4000) > circle(400)  # fifteen moves of 0.03 mm leave no room to brake from full speed
+
+
+def test_no_piece_is_faster_than_the_moves_behind_it_can_brake_from() -> None:
+    count, piece_mm = 3000, 0.1
+    program = read_program([f"G1X{piece_mm * (k + 1):.4f}F6000S5" for k in range(count)])
+    took_s = estimate(program.steps, DYNAMICS).total_s
+    cruise_mm_s = math.sqrt(2 * 500 * 14 * piece_mm)  # fifteen moves, of which one is being made
+    piece_s = 2 * (math.sqrt(cruise_mm_s**2 + 500 * piece_mm) - cruise_mm_s) / 500  # in which it goes up and down again
+    assert took_s == pytest.approx(count * piece_s + cruise_mm_s / 500, rel=0.001)
 
 
 def test_a_pause_is_rounded_up_to_the_board_s_steps() -> None:

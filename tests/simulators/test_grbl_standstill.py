@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks._laser_dialogues import alike, board_time, replay, rows_of
 from simulators.grbl.board import Board
 from simulators.grbl.machine import State
 from tests.simulators.test_grbl_board import board, say
-from tests.simulators.test_grbl_dialogues import alike, board_time, replay, rows_of
 
 STANDS_S = 10 / 25 + 25 / 500  # ten millimetres at F1500 and 500 mm/s²
 
@@ -80,6 +80,14 @@ def test_a_cancelled_jog_returns_to_idle_with_nothing_left() -> None:
     place = b.machine.position_mm()
     say(b, b"~", 0.5)
     assert b.machine.position_mm() == place
+
+
+@pytest.mark.parametrize("pause", [b"!", b"\x84"])
+def test_lines_that_came_during_a_hold_are_answered_when_it_ends(pause: bytes) -> None:
+    b = board()
+    say(b, pause, 0.05)
+    assert say(b, b"G21\nG90\n", 0.2) == ""
+    assert say(b, b"~", 0.2) == "ok\r\nok\r\n"
 
 
 @pytest.mark.parametrize("place", ["10.1", "0.7", "33.3", "-7.9"])
