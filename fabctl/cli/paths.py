@@ -180,5 +180,5 @@ def _later(home: Path, word: str) -> object:
 
 RUN, SPECIMEN = Name(_run_names, _is_run), Name(_specimen_names, _is_specimen)
 RUN_OR_SPECIMEN = Name(lambda home: [*_specimen_names(home), *_run_names(home)], _later)
-SPECIMEN_OR_CLOUD = Name(_specimen_names, _later, files=True)
+SPECIMEN_OR_FILE = Name(_specimen_names, _later, files=True)
 TARGET = Name(_target_names, _later, files=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import bench_option, json_option, lab, progress, say, show
-from fabctl.cli.paths import RUN, SPECIMEN_OR_CLOUD, InFile, InFolder, config_names
+from fabctl.cli.paths import RUN, SPECIMEN_OR_FILE, InFile, InFolder, config_names
 from fabctl.errors import REFUSED, FabctlError, RefusedError, Stopped, UsageError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def command() -> None:
 
 
 @command.command("run")
-@click.argument("words", nargs=-1, type=SPECIMEN_OR_CLOUD, metavar="[SPECIMEN] [CLOUD]")
+@click.argument("words", nargs=-1, type=SPECIMEN_OR_FILE, metavar="[SPECIMEN] [CLOUD]")
 @click.option("--target", type=InFile(), help="Target mesh, for a cloud without a specimen.")
 @click.option(
     "--scale",

@@ -13,7 +13,7 @@ from fabctl.config.material import MaterialConfig
 from fabctl.cut.place import travel_box_mm
 from fabctl.cut.program import Program
 
-BOX_MM = 0.002  # half a step of a usual machine
+BOX_MM = 0.0005  # half of the last decimal that a program has: soft limits are as strict
 THICKNESS_RATIO = 0.02
 
 
