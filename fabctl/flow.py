@@ -18,6 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from fabctl.bench import HELD, Bench
 from fabctl.config.bench import BenchConfig
 from fabctl.errors import BUG, DONE, OPERATOR, OUT_OF_TOLERANCE, FabctlError, UsageError
 from fabctl.events import Emit, Event
@@ -101,8 +102,11 @@ def continued(lab: Workspace, name: str) -> Flow:
     return Flow(name, str(specimen.design))
 
 
-def runner(lab: Workspace) -> Run:
-    """Return a function that runs one fabctl command in `lab` and returns its exit code and its JSON."""
+def runner(lab: Workspace, bench: Bench) -> Run:
+    """Return a function that runs one fabctl command in `lab` and returns its exit code and its JSON.
+
+    The steps work under the lock that the flow holds on `bench`, so that nobody's job comes between two of them.
+    """
 
     def run(words: Sequence[str]) -> tuple[int, dict[str, Any]]:
         command = [sys.executable, "-m", "fabctl", "--home", str(lab.root), *words, "--json"]
@@ -110,7 +114,11 @@ def runner(lab: Workspace) -> Run:
         with (
             _term_raises(),
             subprocess.Popen(
-                command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}
+                command,
+                stdout=subprocess.PIPE,
+                text=True,
+                env={**os.environ, "PYTHONPATH": path, HELD: str(bench.lock)},
+                pass_fds=(bench.lock,),
             ) as process,
         ):
             said = _wait(process)

@@ -16,7 +16,7 @@ import click
 
 from fabctl.cli.paths import config_names
 from fabctl.cli.refusal import answer_no, exit_code_of, plain, refusal, sentence_of
-from fabctl.errors import BUG, DONE, OPERATOR
+from fabctl.errors import BUG, DONE, OPERATOR, Stopped
 from fabctl.events import Emit, Event
 from fabctl.workspace import Workspace, workspace
 
@@ -43,6 +43,12 @@ def lab() -> Workspace:
 def say(text: str = "") -> None:
     """Tell the person something; standard error, so that standard output stays for results."""
     click.echo(text, err=True)
+
+
+def say_keys(text: str) -> None:
+    """Name the keys that act while a job runs, where there is a keyboard."""
+    if sys.stdin.isatty():
+        say(text)
 
 
 def show(data: dict[str, Any], as_json: bool, lines: Iterable[str], code: int = DONE, why: str = "") -> None:
@@ -75,7 +81,10 @@ def confirm(question: str, yes: bool) -> bool:
     if not sys.stdin.isatty():
         say(f"{question} no (not a terminal; --yes answers yes)")
         return False
-    return click.confirm(question, default=False, err=True)
+    try:
+        return click.confirm(question, default=False, err=True)
+    except click.exceptions.Abort:  # Ctrl-C or Ctrl-D at the question is an answer
+        raise Stopped("stopped at the question; nothing was begun") from None
 
 
 def progress() -> Emit:
