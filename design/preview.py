@@ -102,7 +102,7 @@ def few_ticks(axes: Any) -> None:
     lengths = [abs(float(np.ptp(getattr(axes, f"get_{name}lim")()))) for name in "xyz"]
     for name, length in zip("xyz", lengths, strict=True):
         intervals = max(1, round(TICKS_COUNT * length / max(lengths)))
-        getattr(axes, f"{name}axis").set_major_locator(MaxNLocator(intervals))
+        getattr(axes, f"{name}axis").set_major_locator(MaxNLocator(intervals, min_n_ticks=1))
 
 
 def _draw_response(axes: Any, design: Design) -> None:
