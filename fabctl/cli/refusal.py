@@ -113,6 +113,8 @@ def code_of(fault: BaseException) -> str:
         return "USAGE"
     if isinstance(fault, click.exceptions.Abort | KeyboardInterrupt):
         return "STOPPED"
+    if isinstance(fault.__cause__, OSError) and fault.__cause__.errno in STORAGE:
+        return "STORAGE"
     if isinstance(fault, OSError) and not isinstance(fault, DeviceError):
         return "STORAGE" if fault.errno in STORAGE else "FILE"
     if exit_code_of(fault) == BUG:
