@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import click
 
 from fabctl.cli.paths import config_names
-from fabctl.cli.refusal import answer_no, exit_code_of, plain, refusal, sentence_of
+from fabctl.cli.refusal import answer_no, exit_code_of, no_in_words, plain, refusal, sentence_of
 from fabctl.errors import BUG, DONE, OPERATOR, Stopped
 from fabctl.events import Emit, Event
 from fabctl.workspace import Workspace, workspace
@@ -66,6 +66,8 @@ def show(data: dict[str, Any], as_json: bool, lines: Iterable[str], code: int = 
     """
     if as_json:
         click.echo(_json(data if code == DONE else answer_no(data, code, why)))
+        for line in no_in_words(data, why) if code != DONE else ():
+            say(line)
     else:
         _clear_line()
         for line in lines:
