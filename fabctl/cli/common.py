@@ -33,6 +33,7 @@ bench_option = click.option(
     show_default=True,
     help="Bench file or its name.",
 )
+PLACE_MM = click.FloatRange(-10_000, 10_000)  # of anything on a bench
 MATERIAL = config_names("materials")
 
 

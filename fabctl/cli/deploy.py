@@ -28,9 +28,13 @@ if TYPE_CHECKING:
     show_default=True,
     help="What the rim stands on, with --gravity.",
 )
-@click.option("--friction", type=click.FloatRange(0), default=0.5, show_default=True, help="Coefficient for coulomb.")
+@click.option(
+    "--friction", type=click.FloatRange(0, 10), default=0.5, show_default=True, help="Coefficient for coulomb."
+)
 @click.option("--level-floor", is_flag=True, help="A level floor instead of a bed made to the rim.")
-@click.option("--shapes", type=click.IntRange(0), default=0, help="Look for other equilibria from this many starts.")
+@click.option(
+    "--shapes", type=click.IntRange(0, 10_000), default=0, help="Look for other equilibria from this many starts."
+)
 @click.option("--compensate", is_flag=True, help="Build DESIGN-compensated: other expansions, nearer to the target.")
 @click.option("--cascade", "by_unit", is_flag=True, help="Open the sheet from flat, one unit after the other.")
 @click.option("--animation/--no-animation", default=True, help="Write the deployment as an animated picture.")

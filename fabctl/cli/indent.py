@@ -34,8 +34,12 @@ def command() -> None:
 @click.option(
     "--resume", type=RUN, metavar="RUN", help="Go on with an interrupted run, at its next whole curve or point."
 )
-@click.option("--temperature-degC", type=float, help="Room temperature, where the rig has no sensor of its own.")
-@click.option("--humidity-frac", type=float, help="Relative humidity, 0 to 1.")
+@click.option(
+    "--temperature-degC",
+    type=click.FloatRange(-50, 150),
+    help="Room temperature, where the rig has no sensor of its own.",
+)
+@click.option("--humidity-frac", type=click.FloatRange(0, 1), help="Relative humidity, 0 to 1.")
 @click.option("--dry-run", is_flag=True, help="Stop after the check; nothing moves.")
 @yes_option
 @json_option

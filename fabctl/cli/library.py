@@ -27,10 +27,14 @@ material_option = click.option(
 file_option = click.option(
     "--library", "file", type=InFile(), help="A library file [the shipped one of the paper's sheet]."
 )
-t_option = click.option("--t-mm", type=float, required=True, help="Where slit 1 starts on its edge.")
-theta_option = click.option("--theta-deg", type=float, required=True, help="Direction of slit 1.")
+t_option = click.option(
+    "--t-mm", type=click.FloatRange(-1000, 1000), required=True, help="Where slit 1 starts on its edge."
+)
+theta_option = click.option("--theta-deg", type=click.FloatRange(-360, 360), required=True, help="Direction of slit 1.")
 TOLD_ROWS_COUNT = 10  # of the rows without numbers, for a person
-jobs_option = click.option("--jobs", type=int, default=-1, show_default=True, help="Processes; -1 is one per core.")
+jobs_option = click.option(
+    "--jobs", type=click.IntRange(-1, 1024), default=-1, show_default=True, help="Processes; -1 is one per core."
+)
 
 
 def _sheet(material: str) -> Sheet:
@@ -47,9 +51,9 @@ def command() -> None:
 @command.command()
 @material_option
 @click.option(
-    "--theta", "theta_count", type=click.IntRange(5), default=43, show_default=True, help="Angles, -30° to 30°."
+    "--theta", "theta_count", type=click.IntRange(5, 1001), default=43, show_default=True, help="Angles, -30° to 30°."
 )
-@click.option("--t-step-mm", type=float, default=0.01, show_default=True, help="Step of t.")
+@click.option("--t-step-mm", type=click.FloatRange(0.001, 10), default=0.01, show_default=True, help="Step of t.")
 @click.option(
     "--open", "is_open", is_flag=True, help="The contracting kind: cut as holes, closing to its second state."
 )
@@ -159,8 +163,10 @@ def show_command(file: Path | None, as_json: bool) -> None:
 
 @command.command()
 @file_option
-@click.option("--t-mm", type=float, help="Plot energy and force of this cell instead of the maps.")
-@click.option("--theta-deg", type=float)
+@click.option(
+    "--t-mm", type=click.FloatRange(-1000, 1000), help="Plot energy and force of this cell instead of the maps."
+)
+@click.option("--theta-deg", type=click.FloatRange(-360, 360))
 @click.option("-o", "--output", type=PictureFile(), default=Path("library.svg"), show_default=True)
 @json_option
 def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output: Path, as_json: bool) -> None:
