@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from fabctl.indent.run import Ending, Runner, Wish, resumed
 from fabctl.priority import before_other_work
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Specimen, Workspace
+
+DRIFT_TOLD_FRAC = 0.01  # a drift of so much of the stiffness is told
 
 
 @dataclass(frozen=True)
@@ -166,12 +168,27 @@ def result_of(run: RunFolder, plan: IndentPlan, ending: Ending) -> dict[str, Any
         "rows_count": ending.rows_count,
         "lost_replies_count": ending.lost_count,
         "tares_N": ending.tares_N,
-        "findings": [f.as_dict() for f in plan.findings],
+        "findings": [f.as_dict() for f in (*plan.findings, *_drifting(body["curves"]))],
         "predicted_secant_N_mm": None,
     }
     if plan.predicted is not None and plan.predicted.depth_mm[-1] >= plan.method.secant_mm:
         body["predicted_secant_N_mm"] = plan.predicted.secant_N_mm(plan.method.secant_mm)
     return body
+
+
+def _drifting(curves: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
+    """Say which curves began while the force was drifting."""
+    worst = max(curves, key=lambda curve: abs(curve.get("drift_N_mm") or 0.0), default=None)
+    drift_N_mm = (worst or {}).get("drift_N_mm") or 0.0
+    if worst is not None and abs(drift_N_mm) > DRIFT_TOLD_FRAC * abs(worst.get("stiffness_secant_N_mm") or 0.0):
+        count = sum(bool(curve.get("drift_N_mm")) for curve in curves)
+        yield Finding(
+            "INDENT-DRIFT",
+            f"in {count} of {len(curves)} curves the force drifts before contact, by up to {1000 * drift_N_mm:.2g} mN/mm; "
+            "the contact is found beside it, forces under load may hold it",
+            "warning",
+            hint="let the load cell warm up, look for a cable that is dragged along, go faster",
+        )
 
 
 def curves_done(run: RunFolder) -> list[tuple[int, int]]:
