@@ -184,8 +184,8 @@ def _drifting(curves: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
         count = sum(bool(curve.get("drift_N_mm")) for curve in curves)
         yield Finding(
             "INDENT-DRIFT",
-            f"in {count} of {len(curves)} curves the force drifts before contact, by up to {1000 * drift_N_mm:.2g} mN/mm; "
-            "the contact is found beside it, forces under load may hold it",
+            f"in {count} of {len(curves)} curves the force drifts before contact, by up to {1000 * drift_N_mm:.2g} mN/mm"
+            "; the contact is found beside it, forces under load may hold it",
             "warning",
             hint="let the load cell warm up, look for a cable that is dragged along, go faster",
         )
