@@ -14,7 +14,7 @@ import click
 from fabctl.events import Emit, Event
 
 if TYPE_CHECKING:
-    from fabctl.indent.run import Wish
+    from fabctl.indent.sampling import Wish
 
 PLOT_COLUMNS, PLOT_ROWS = 60, 12
 DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))

@@ -150,22 +150,28 @@ def read_predicted(path: Path) -> Predicted:
 
 def time_s(plan: Sequence[Action], travel_speed_mm_s: float, approach_mm: float = 10.0) -> float:
     """Return about how long the plan takes; waiting for the operator counts nothing."""
-    total, depth_mm, clearance_mm = 0.0, 0.0, 1.0
+    return sum(times_s(plan, travel_speed_mm_s, approach_mm))
+
+
+def times_s(plan: Sequence[Action], travel_speed_mm_s: float, approach_mm: float = 10.0) -> list[float]:
+    """Return about how long each action takes."""
+    found, depth_mm, clearance_mm = [], 0.0, 1.0
     for action in plan:
-        total += action.time_s + 0.1
+        own = action.time_s + 0.1
         if action.kind == "approach":
             clearance_mm = action.clearance_mm
-            total += approach_mm / action.speed_mm_s + clearance_mm / action.speed_mm_s
+            own += approach_mm / action.speed_mm_s + clearance_mm / action.speed_mm_s
             depth_mm = -clearance_mm
         elif action.kind in ("load", "unload", "preload"):
             goal = (
                 action.depth_mm if action.depth_mm is not None else (-clearance_mm if action.kind == "unload" else 2.0)
             )
-            total += abs(goal - depth_mm) / action.speed_mm_s
+            own += abs(goal - depth_mm) / action.speed_mm_s
             depth_mm = goal
         elif action.kind == "travel":
-            total += 2 * approach_mm / travel_speed_mm_s + 15 / action.speed_mm_s
-    return total
+            own += 2 * approach_mm / travel_speed_mm_s + 15 / action.speed_mm_s
+        found.append(own)
+    return found
 
 
 def check(
