@@ -11,6 +11,7 @@ import io
 import json
 import math
 import re
+import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -25,7 +26,7 @@ from design.cells.homogenise import CURVE_SHARES, Cell
 from design.cells.interpolate import Grid, grid_of
 from design.cells.sheet import Sheet
 from design.cells.sweep import Plan
-from design.errors import DesignError
+from design.errors import UnreadableFile
 
 Array = NDArray[np.float64]
 FORMAT = 1
@@ -37,7 +38,7 @@ NUMBERS = ("expansion_ratio", "saddle_ratio", "barrier_mm2", "stored_mm2", "stif
 OPEN_NUMBERS = ("open_ratio", "overlap_frac")
 
 
-class LibraryError(DesignError):
+class LibraryError(UnreadableFile):
     """The file is not a library, or not one this version reads."""
 
 
@@ -245,13 +246,24 @@ def load_library(path: Path | None = None) -> CellLibrary:
         with np.load(source) as file:
             table = {name: file[name] for name in file.files if name != "meta"}
             meta = json.loads(file["meta"].tobytes())
-    except (OSError, ValueError, KeyError) as fault:
-        raise LibraryError(
-            f"{source}: not a library of cells ({fault}); build one with `fabctl library build`"
-        ) from fault
-    if meta.get("format") != FORMAT:
-        raise LibraryError(f"{source}: format {meta.get('format')}, this version reads {FORMAT}; build it anew")
-    return _with_sheet(table, meta, meta["key"], Sheet(**meta["sheet"]))
+    except (OSError, ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as fault:
+        raise LibraryError(f"{source}: {_why_not(fault)}; build one with `fabctl library build`") from fault
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        told = meta.get("format") if isinstance(meta, dict) else "unknown"
+        raise LibraryError(f"{source}: format {told}, this version reads {FORMAT}; build it anew")
+    try:
+        return _with_sheet(table, meta, meta["key"], Sheet(**meta["sheet"]))
+    except (ValueError, KeyError, TypeError, IndexError) as fault:
+        raise LibraryError(f"{source}: is damaged: its table is not whole; build it anew") from fault
+
+
+def _why_not(fault: Exception) -> str:
+    """Return in words why a file is no library: NumPy's are about pickles and magic strings."""
+    if isinstance(fault, FileNotFoundError):
+        return "no such file"
+    if isinstance(fault, OSError) and fault.strerror:
+        return f"cannot be read: {fault.strerror.lower()}"
+    return "holds no library of cells" if isinstance(fault, KeyError) else "is no library of cells, or damaged"
 
 
 def _with_sheet(table: dict[str, Array], meta: dict[str, Any], key: str, sheet: Sheet) -> CellLibrary:

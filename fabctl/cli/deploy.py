@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import json_option, lab, progress, show
+from fabctl.cli.paths import InFolder, OutFolder
 
 if TYPE_CHECKING:
     from design.deploy.predict import Deployed
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("design", type=click.Path(path_type=Path))
+@click.argument("design", type=InFolder())
 @click.option("--gravity", is_flag=True, help="Let the sheet's own weight act (along −z).")
 @click.option(
     "--support",
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 @click.option("--compensate", is_flag=True, help="Build DESIGN-compensated: other expansions, nearer to the target.")
 @click.option("--cascade", "by_unit", is_flag=True, help="Open the sheet from flat, one unit after the other.")
 @click.option("--animation/--no-animation", default=True, help="Write the deployment as an animated picture.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder to write into [DESIGN-deployed].")
+@click.option("-o", "--output", type=OutFolder(), help="Folder to write into [DESIGN-deployed].")
 @json_option
 def command(
     design: Path,

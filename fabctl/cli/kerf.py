@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import bench_option, json_option, lab, show
+from fabctl.cli.common import MATERIAL, bench_option, json_option, lab, show
 from fabctl.cli.finite import numbers
+from fabctl.cli.paths import InFile, OutFolder
 
 if TYPE_CHECKING:
     from fabctl.vision.kerf import KerfMeasurement
-
-PATH = click.Path(path_type=Path)
-FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.group("kerf")
@@ -24,9 +21,13 @@ def command() -> None:
 
 
 @command.command("coupon")
-@click.option("--material", required=True, help="Material file or its name; its preset gives speed and passes.")
+@click.option(
+    "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives speed and passes."
+)
 @click.option("--powers", default=None, metavar="0.4,0.5,…", help="Power steps; around the preset's when not given.")
-@click.option("-o", "--output", type=PATH, default=Path("coupon"), show_default=True, help="Folder to write into.")
+@click.option(
+    "-o", "--output", type=OutFolder(), default=Path("coupon"), show_default=True, help="Folder to write into."
+)
 @bench_option
 @json_option
 def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_json: bool) -> None:
@@ -70,24 +71,23 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
 
 
 @command.command("measure")
-@click.argument("image", type=FILE)
-@click.option("--coupon", "coupon_file", type=FILE, required=True, help="The coupon.json of the coupon in the picture.")
+@click.argument("image", type=InFile())
+@click.option(
+    "--coupon", "coupon_file", type=InFile(), required=True, help="The coupon.json of the coupon in the picture."
+)
 @click.option("--write", is_flag=True, help="Write the kerf into the lab's material file.")
 @click.option("--gamma", type=click.Choice(["srgb", "linear"]), default="srgb", show_default=True)
 @json_option
 def measure(image: Path, coupon_file: Path, write: bool, gamma: str, as_json: bool) -> None:
     """Measure the kerf per power and direction in a picture of the coupon, with its uncertainty."""
-    from drivers.camera import read_picture
     from fabctl.config.material import load_material
     from fabctl.errors import UsageError
+    from fabctl.files import json_of, picture_of
     from fabctl.vision import kerf as kerfs
     from fabctl.vision.coupon import coupon_from
 
-    try:
-        facts = json.loads(coupon_file.read_text(encoding="utf-8"))
-    except ValueError as fault:
-        raise UsageError(f"{coupon_file}: not JSON: {fault}") from fault
-    frame = read_picture(image)
+    facts = json_of(coupon_file, "the coupon.json of `fabctl kerf coupon`")
+    frame = picture_of(image)
     found = kerfs.measure(frame.image, frame.source, coupon_from(facts, str(coupon_file)), gamma)
     data, lines = _table(found)
     if write:

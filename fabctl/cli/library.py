@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from fabctl.cli.common import json_option, lab, progress, say, show
-from fabctl.cli.finite import PictureFile
+from fabctl.cli.common import MATERIAL, json_option, lab, progress, say, show
+from fabctl.cli.paths import InFile, OutFile, PictureFile
 
 if TYPE_CHECKING:
     from design.cells.compare import Comparison, Unanswered
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from design.cells.sweep import Progress
 
 material_option = click.option(
-    "--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name."
+    "--material", type=MATERIAL, default="natural-rubber-2.3", show_default=True, help="Material file or its name."
 )
 file_option = click.option(
-    "--library", "file", type=click.Path(path_type=Path), help="A library file [the shipped one of the paper's sheet]."
+    "--library", "file", type=InFile(), help="A library file [the shipped one of the paper's sheet]."
 )
 t_option = click.option("--t-mm", type=float, required=True, help="Where slit 1 starts on its edge.")
 theta_option = click.option("--theta-deg", type=float, required=True, help="Direction of slit 1.")
@@ -55,7 +55,7 @@ def command() -> None:
 )
 @jobs_option
 @click.option("--cluster", metavar="URL", help="A dask scheduler, tcp://HOST:PORT, whose workers have fabctl.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("library.npz"), show_default=True)
+@click.option("-o", "--output", type=OutFile((".npz",), "a library"), default=Path("library.npz"), show_default=True)
 @json_option
 def build(
     material: str,
@@ -250,7 +250,7 @@ def _numbers(cell: Cell, sheet: Sheet) -> dict[str, Any]:
 
 
 @command.command()
-@click.argument("published", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("published", type=InFile())
 @material_option
 @file_option
 @jobs_option
@@ -264,11 +264,12 @@ def compare(published: Path, material: str, file: Path | None, jobs: int, as_jso
     from design.cells.library import load_library
     from fabctl.errors import UsageError
     from fabctl.events import Event
+    from fabctl.files import text_of
 
-    sheet = _sheet(material)
+    sheet, library = _sheet(material), load_library(file)
     try:
-        table = comparing.read_published(published.read_text(encoding="utf-8"), sheet)
-    except (comparing.TableError, UnicodeDecodeError) as fault:
+        table = comparing.read_published(text_of(published, "a table of cells"), sheet)
+    except comparing.TableError as fault:
         raise UsageError(f"{published}: {fault}") from fault
     listen, total = progress(), len(table.t_mm)
     cells = comparing.solve_rows(
@@ -280,7 +281,7 @@ def compare(published: Path, material: str, file: Path | None, jobs: int, as_jso
     lines = [f"{total} rows, {int(subset.sum())} comparable"]
     ways = {
         "solved": comparing.columns_of(cells),
-        "interpolated": comparing.interpolated(table, load_library(file).scaled(sheet)),
+        "interpolated": comparing.interpolated(table, library.scaled(sheet)),
     }
     for way, numbers in ways.items():
         fair = comparing.compared(table, numbers, subset if subset.any() else everything)
@@ -340,8 +341,8 @@ def _finite(value: Any) -> Any:
 
 
 @command.command()
-@click.argument("measured", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.argument("response", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("measured", type=InFile())
+@click.argument("response", type=InFile())
 @material_option
 @json_option
 def calibrate(measured: Path, response: Path, material: str, as_json: bool) -> None:
@@ -375,8 +376,10 @@ def _curve(path: Path) -> tuple[Any, Any]:
     import numpy as np
 
     from fabctl.errors import UsageError
+    from fabctl.files import text_of
 
-    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    text = text_of(path, "a CSV with the columns depth_mm and load_N")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     rows = list(csv.DictReader(lines))
     force = next((name for name in ("load_N", "force_N") if rows and name in rows[0]), None)
     if force is None or "depth_mm" not in rows[0]:

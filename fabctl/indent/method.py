@@ -28,6 +28,7 @@ from fabctl.config.method import (
     Zero,
 )
 from fabctl.errors import UsageError
+from fabctl.files import text_of
 
 Kind = Literal["tare", "approach", "preload", "zero", "load", "hold", "unload", "wait", "travel"]
 
@@ -135,12 +136,12 @@ class Predicted:
 def read_predicted(path: Path) -> Predicted:
     """Return a design's `response.csv`; raise `UsageError` where it is not one."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = text_of(path, "a design's response.csv").splitlines()
         rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
         depth = np.array([float(row["depth_mm"]) for row in rows])
         load = np.array([float(row["load_N"]) for row in rows])
-    except (OSError, KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{path}: not a response of a design: {fault}") from fault
+    except (KeyError, TypeError, ValueError) as fault:
+        raise UsageError(f"{path}: not a response of a design: no numbers under depth_mm and load_N") from fault
     if not lines or not lines[0].startswith("# fabctl response 1") or len(depth) < 2:
         raise UsageError(f"{path}: not a response of version 1")
     facts = dict(part.strip().split("=", 1) for part in lines[0].split(";")[1:] if "=" in part)
