@@ -12,6 +12,8 @@ import click
 from fabctl.cli.common import bench_option, json_option, lab, say, show
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from design.pattern.paths import CutPath
     from drivers.camera import Frame
     from fabctl.config.bench import BenchConfig
@@ -146,7 +148,6 @@ def show_picture(bench_name: str, output: Path, as_json: bool) -> None:
 @json_option
 def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_name: str, as_json: bool) -> None:
     """Measure the lens from PICTURES of a ChArUco board, or from the bench's camera."""
-    from drivers.camera import read_picture
     from fabctl.config.boards import load_board
     from fabctl.errors import UsageError
     from fabctl.vision import lens
@@ -158,7 +159,9 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
     if config.measured_mm is None:
         say(f"{board_name}: not measured after printing; the lens does not mind, distances would")
     bench, state = bench_and_state(bench_name)
-    frames = [read_picture(path) for path in pictures] or _live(bench, state, views)
+    frames = _readable(pictures) if pictures else _live(bench, state, views)
+    if not frames:
+        raise UsageError(f"none of the {len(pictures)} files is a picture that can be read")
     seen = [lens.find_board(frame.image, config.charuco(), frame.source) for frame in frames]
     for _, found in seen:
         for finding in found:
@@ -326,9 +329,34 @@ def bench_and_state(name: str) -> tuple[BenchConfig, Path]:
 
 def bed_picture(bench_name: str, image: Path | None) -> Frame:
     """Return the picture in the file, or a fresh one from the bench's camera."""
-    from drivers.camera import read_picture, snapshot
+    from drivers.camera import snapshot
 
-    return read_picture(image) if image is not None else snapshot(_camera_url(*bench_and_state(bench_name)))
+    return picture_file(image) if image is not None else snapshot(_camera_url(*bench_and_state(bench_name)))
+
+
+def picture_file(path: Path) -> Frame:
+    """Return the picture in a file; raise `UsageError` where it is none: no device is to blame."""
+    from drivers.camera import read_picture
+    from drivers.errors import TransportError
+    from fabctl.errors import UsageError
+
+    try:
+        return read_picture(path)
+    except TransportError as fault:
+        raise UsageError(str(fault)) from fault
+
+
+def _readable(pictures: Iterable[Path]) -> list[Frame]:
+    """Return the pictures that can be read; name the others."""
+    from fabctl.errors import UsageError
+
+    frames = []
+    for path in pictures:
+        try:
+            frames.append(picture_file(path))
+        except UsageError as fault:
+            say(f"left out: {fault}")
+    return frames
 
 
 def _camera_url(bench: BenchConfig, state: Path) -> str:

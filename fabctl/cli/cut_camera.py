@@ -27,7 +27,8 @@ def eye_of(
 
     A registration of `fabctl camera register` is believed only while the bed still shows the sheet there.
     """
-    from drivers.camera import read_picture, snapshot
+    from drivers.camera import snapshot
+    from fabctl.cli.camera import picture_file
     from fabctl.config.boards import load_board
     from fabctl.cut.by_camera import BedEye
     from fabctl.errors import UsageError
@@ -41,7 +42,7 @@ def eye_of(
     board = load_board(expected.sheet if expected is not None else marks, lab().root).mark_sheet()
 
     def take() -> Any:
-        return read_picture(image) if image is not None else snapshot(bench.url("camera"))
+        return picture_file(image) if image is not None else snapshot(bench.url("camera"))
 
     height_mm = expected.height_mm if expected is not None else thickness_mm
     return BedEye(bench.state, board, height_mm, take, at_mm, expected, again=image is None)

@@ -89,12 +89,12 @@ def _fact(text: str) -> tuple[str, Any]:
 def read(image: Path, as_json: bool) -> None:
     """Read the engraved ids in a picture, and say which runs they have."""
     from design.findings import Finding, errors
-    from drivers.camera import read_picture
+    from fabctl.cli.camera import picture_file
     from fabctl.errors import RefusedError
     from fabctl.vision.ids import read_ids
     from fabctl.vision.quality import picture_findings
 
-    frame = read_picture(image)
+    frame = picture_file(image)
     found = picture_findings(frame.image, frame.source)
     ids = [] if errors(found) else read_ids(frame.image)
     if not ids:
