@@ -152,6 +152,7 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
     from fabctl.errors import UsageError
     from fabctl.vision import lens
     from fabctl.vision.bed import lens_path
+    from fabctl.vision.overlay import coverage_map, write_picture
 
     config = load_board(board_name, lab().root)
     if config.kind != "charuco":
@@ -171,12 +172,17 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
         raise UsageError(f"the pictures have {len(sizes)} sizes; a lens is measured at one")
     h, w = sizes.pop()
     good = [view for view, _ in seen if view is not None]
-    made = lens.calibrate(good, (w, h), config.charuco(), datetime.now(UTC).isoformat())
     path = lens_path(state, bench.camera.calibration if bench.camera else None)
+    drawn = path.with_suffix(".png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(str(drawn), coverage_map(good, (w, h)))
+    say(f"{drawn}: where in the frame the board was seen")
+    made = lens.calibrate(good, (w, h), config.charuco(), datetime.now(UTC).isoformat())
     lens.write_lens(made.lens, path, {"views": dict(zip(made.sources, made.view_rms_px, strict=True))})
     facts = made.lens
     data = {
         "lens": str(path),
+        "picture": str(drawn),
         "views_count": facts.views_count,
         "rms_px": facts.rms_px,
         "repeat_px": facts.repeat_px,

@@ -209,11 +209,16 @@ def _rotation(turn: F64) -> F64:
 
 def _coverage(views: Sequence[BoardView], size_px: tuple[int, int]) -> float:
     """Return which part of the frame's cells holds at least one corner."""
+    return len(covered_cells(views, size_px)) / math.prod(COVERAGE_CELLS)
+
+
+def covered_cells(views: Sequence[BoardView], size_px: tuple[int, int]) -> set[tuple[int, int]]:
+    """Return column and row of every cell of the frame that holds at least one corner."""
     if not views:
-        return 0.0
+        return set()
     points = np.vstack([view.corners_px for view in views]) / np.array(size_px)
     cells = np.clip((points * np.array(COVERAGE_CELLS)).astype(int), 0, np.array(COVERAGE_CELLS) - 1)
-    return len({tuple(cell) for cell in cells}) / math.prod(COVERAGE_CELLS)
+    return {(int(column), int(row)) for column, row in cells}
 
 
 def _disagreement(first: tuple[F64, F64], second: tuple[F64, F64], size_px: tuple[int, int]) -> float:

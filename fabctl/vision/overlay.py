@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from design.pattern.paths import CutPath
 from fabctl.vision.align import Alignment
 from fabctl.vision.inspect import Inspection
+from fabctl.vision.lens import COVERAGE_CELLS, BoardView, covered_cells
 from fabctl.vision.profile import ToPixels
 from fabctl.vision.register import Registration, apply
 from fabctl.vision.template import F64
@@ -117,6 +118,28 @@ def _legend(width_px: int, rows: Sequence[tuple[str, Colour]]) -> Picture:
         place, white = (x + line + pad, middle + round(0.27 * line)), (240, 240, 240)
         cv2.putText(band, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8 * scale, white, 1, cv2.LINE_AA)
     return band
+
+
+def coverage_map(views: Sequence[BoardView], size_px: tuple[int, int]) -> Picture:
+    """Return the frame with every corner that a lens is measured by; cells of it that hold none are drawn red."""
+    import cv2
+
+    w, h = size_px
+    picture: Picture = np.full((h, w, 3), 245, np.uint8)
+    covered = covered_cells(views, size_px)
+    columns, rows = COVERAGE_CELLS
+    for c in range(columns):
+        for r in range(rows):
+            low, high = (w * c // columns, h * r // rows), (w * (c + 1) // columns - 1, h * (r + 1) // rows - 1)
+            if (c, r) not in covered:
+                cv2.rectangle(picture, low, high, (170, 170, 250), -1)
+            cv2.rectangle(picture, low, high, (200, 200, 200), 1)
+    radius = max(2, w // 400)
+    for corner in np.vstack([view.corners_px for view in views]) if views else []:
+        cv2.circle(picture, _whole(corner), radius, (140, 90, 20), -1, cv2.LINE_AA)
+    text = f"{len(views)} pictures, {len(covered)} of {columns * rows} cells seen"
+    cv2.putText(picture, text, (20, 40), cv2.FONT_HERSHEY_SIMPLEX, max(0.5, w / 1500), (20, 20, 20), 2, cv2.LINE_AA)
+    return picture
 
 
 def error_map(image: Picture, alignment: Alignment) -> Picture:
