@@ -121,9 +121,10 @@ def rim_axis(target: Target) -> tuple[Floats, Floats] | None:
     if border is None or border.loop.max() == 0:
         return None
     longest = int(np.argmax(np.bincount(border.loop, border.length_mm)))
-    points = border.points_mm[border.loop == longest]
-    middle = points.mean(axis=0)
-    return middle, np.linalg.svd(points - middle, full_matrices=False)[2][2]
+    mine = border.loop == longest
+    points, length = border.points_mm[mine], border.length_mm[mine, None]
+    middle = np.asarray((length * points).sum(axis=0) / length.sum())
+    return middle, np.linalg.svd(np.sqrt(length) * (points - middle), full_matrices=False)[2][2]
 
 
 def turn_motion(axis: tuple[Floats, Floats], target: Target) -> Floats:
