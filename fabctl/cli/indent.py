@@ -15,6 +15,17 @@ if TYPE_CHECKING:
     from fabctl.indent.job import IndentPlan
     from fabctl.records.folder import RunFolder
 
+NAMED = (
+    ("stiffness at contact", "stiffness_initial_N_mm", "N/mm"),
+    ("secant stiffness", "stiffness_secant_N_mm", "N/mm"),
+    ("largest force", "force_max_N", "N"),
+    ("energy in", "load_energy_mJ", "mJ"),
+    ("hysteresis", "hysteresis_ratio", ""),
+    ("barrier", "barrier_mJ", "mJ"),
+    ("recovery", "recovery_ratio", ""),
+)
+WORDS = {name: words for words, name, _ in NAMED}
+
 
 @click.group()
 def command() -> None:
@@ -99,7 +110,8 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
     lines = []
     for name, found in body["groups"].items():
         lines.append(f"{name}: {len(found['runs'])} runs")
-        lines += list(_lines(found["runs"][0]["result"])) if len(found["runs"]) == 1 else []
+        one = len(found["runs"]) == 1
+        lines += list(_lines(found["runs"][0]["result"])) if one else [_short(each) for each in found["runs"]]
         if found.get("stiffness_secant_N_mm") is not None:
             spread = found["stiffness_secant_N_mm"]
             lines.append(f"  secant stiffness {spread['mean']:.4g} ± {spread['sd']:.2g} N/mm (n = {spread['count']})")
@@ -109,7 +121,10 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
             if ratio["low_ratio"] is not None
             else f"no interval: {ratio['reason']}"
         )
-        lines.append(f"{ratio['above']} / {ratio['below']}: {ratio['value_ratio']:.3f}, 95 % {ends} ({ratio['how']})")
+        what = WORDS.get(ratio["figure"], ratio["figure"])
+        lines.append(
+            f"{ratio['above']} / {ratio['below']}, {what}: {ratio['value_ratio']:.3f}, 95 % {ends} ({ratio['how']})"
+        )
     show(body, as_json, lines)
 
 
@@ -166,17 +181,19 @@ def _render(run: RunFolder, as_json: bool) -> None:
     show(body, as_json, [f"run {run.run_id}", *_lines(result), f"  {run.path / 'artefacts' / 'curve.svg'}"])
 
 
+def _short(entry: dict[str, Any]) -> str:
+    """Return one run among several in one line."""
+    result = entry["result"]
+    secant, most = result.get("stiffness_secant_N_mm"), result.get("force_max_N")
+    if secant is None:
+        why = result.get("not_found", {}).get("stiffness_secant_N_mm", "no curve")
+        return f"  {entry['run']} ({entry['status']}): secant stiffness not found: {why}"
+    half = result.get("stiffness_secant_ci95_N_mm") or 0.0
+    return f"  {entry['run']} ({entry['status']}): secant {secant:.4g} ± {half:.2g} N/mm, largest force {most:.4g} N"
+
+
 def _lines(result: dict[str, Any]) -> Iterator[str]:
-    named = (
-        ("stiffness at contact", "stiffness_initial_N_mm", "N/mm"),
-        ("secant stiffness", "stiffness_secant_N_mm", "N/mm"),
-        ("largest force", "force_max_N", "N"),
-        ("energy in", "load_energy_mJ", "mJ"),
-        ("hysteresis", "hysteresis_ratio", ""),
-        ("barrier", "barrier_mJ", "mJ"),
-        ("recovery", "recovery_ratio", ""),
-    )
-    for words, name, unit in named:
+    for words, name, unit in NAMED:
         value = result.get(name)
         if value is None:
             yield f"  {words:22} not found: {result.get('not_found', {}).get(name, 'no curve')}"

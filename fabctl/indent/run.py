@@ -320,4 +320,5 @@ def spoken(action: Action) -> str:
     which = f" (curve {action.curve}{', conditioning' if action.condition else ''})" if action.curve else ""
     rate = f" at {action.speed_mm_s:g} mm/s" if action.speed_mm_s else ""
     span = f" for {action.time_s:g} s" if action.time_s else ""
-    return f"{action.kind}{goal}{rate}{span}{which}"
+    asked = f": {action.message}" if action.message else ""
+    return f"{action.kind}{goal}{rate}{span}{which}{asked}"

@@ -170,10 +170,11 @@ class Sampler:
 
     def _show(self, position_mm: float, force_N: float, now_s: float) -> None:
         depth_mm = None if self.zero_mm is None else position_mm - self.zero_mm
-        step = "paused" if self.time_left.holds and self.action.kind != "wait" else self.action.kind
+        step: str = self.action.kind
+        if step != "wait" and (self.time_left.holds or self._wished == "pause"):
+            step = "paused" if self.time_left.holds else "pausing"  # it begins at the next motion
         place = f"at {position_mm:.3f} mm" if depth_mm is None else f"{depth_mm:8.3f} mm"
         words = f"{step:8} {force_N:8.3f} N {place}  {self.time_left.left_s(now_s):4.0f} s left"
-        if self._wished == "pause" and not self.time_left.holds:
-            words += ", pauses at the next motion"
+        words += f", point {self.action.point}" if self.action.point else ""
         facts = {"force_N": force_N, "depth_mm": depth_mm, "step": step, "point": self.action.point}
         self.emit(Event("progress", words, self.time_left.done_frac(now_s), data={**facts, "curve": self.action.curve}))
