@@ -224,8 +224,8 @@ def sheet_of(material: MaterialConfig, edge_mm: float) -> Sheet:
 
 def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
     """Return how each layer is cut; raise `RefusedError` for a material that must not, or cannot yet, be cut."""
-    if material.never_cut_because:
-        danger = Finding("MATERIAL-NEVER", material.never_cut_because, where=material.name)
+    if material.danger:
+        danger = Finding("MATERIAL-NEVER", material.danger, where=material.name)
         raise RefusedError(f"{material.name} must not be cut", [danger])
     if material.laser is None:
         missing = Finding("MATERIAL-LASER", "has no laser preset", where=material.name, hint="cut a power-speed grid")

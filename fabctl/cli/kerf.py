@@ -44,8 +44,8 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
     from fabctl.vision import coupon as coupons
 
     stuff = load_material(material, lab().root)
-    if stuff.never_cut_because or stuff.laser is None:
-        raise UsageError(f"{stuff.name}: {stuff.never_cut_because or 'no laser preset'}; it is not cut")
+    if stuff.danger or stuff.laser is None:
+        raise UsageError(f"{stuff.name}: {stuff.danger or 'no laser preset'}; it is not cut")
     laser = load_bench(bench_name, lab().root).laser
     if laser is None:
         raise UsageError(f"bench {bench_name} has no laser")
