@@ -19,6 +19,7 @@ from design.cells.sheet import Sheet
 from design.coupon import Coupon, coupon
 from design.export.gcode import GcodeOptions
 from design.findings import Finding
+from design.flatten.cut import chain_through
 from design.job import JobOptions, compose_job
 from design.meshfiles import read_given_flat, read_mesh
 from design.pattern.paths import Layer, LayerPreset
@@ -79,6 +80,10 @@ def _inputs_of(
     if config.flatten.source == "target":
         flat_mm = read_given_flat(target_file(config, beside, target), mesh)
         spec = changed(spec, flatten=changed(spec.flatten, given_mm=flat_mm))
+    if config.flatten.cut_mm is not None:
+        spec = changed(
+            spec, flatten=changed(spec.flatten, cut_path=chain_through(mesh, np.array(config.flatten.cut_mm)))
+        )
     file = library or library_file(config, beside)
     cells = library_of(config, file).scaled(sheet)
     return Inputs(spec, keeping("library", file, text), mesh, cells, presets, tuple(findings))
