@@ -1,6 +1,6 @@
 """Figures of the deployed shape: `python -m benchmarks deploy [PART …]`.
 
-Parts: derivatives, forms, targets, vase, caps, gravity, compensation, time.
+Parts: derivatives, forms, targets, turned, vase, caps, gravity, compensation, time.
 
 The published targets are read from `$FABCTL_SHARED` or `shared` beside the project; without them those figures are left
 out and said to be.
@@ -49,12 +49,13 @@ Reals = NDArray[np.float64]
 def measure(words: list[str]) -> list[Figure]:
     """Return the figures of the parts named, of all where none is."""
     parts: dict[str, Callable[[], list[Figure]]] = {
-        "derivatives": derivatives, "forms": closed_forms, "targets": solver_check, "vase": welded_vase,
-        "caps": two_caps, "gravity": gravity, "compensation": compensation, "time": times,
+        "derivatives": derivatives, "forms": closed_forms, "targets": solver_check,
+        "turned": turned_lattices, "vase": welded_vase, "caps": two_caps, "gravity": gravity,
+        "compensation": compensation, "time": times,
     }  # fmt: skip
     wanted = [word for word in words if not word.startswith("-")] or [
-        part for part in parts if part != "vase"
-    ]  # targets has it too
+        part for part in parts if part not in ("turned", "vase")
+    ]  # targets has them too
     return [figure for word in wanted for figure in parts[word]()]
 
 
@@ -199,9 +200,23 @@ def solver_check() -> list[Figure]:
             figures.append(Figure(target, "published target not here", "", f"≤ {limit} %", None, 0))
             continue
         for name, D, asked in (("prescribed D", PRESCRIBED_MJ, limit), ("computed D, 10 mm cells", None, None)):
-            layout, goal = tiled(mesh, 920 if D else None, D)
+            layout, goal = tiled(mesh, 920 if D else None, D, target)
             figures += _every_shape(f"{target}, {name}", layout, goal, mesh, asked)
-    return [*figures, *welded_vase()]
+    return [*figures, *turned_lattices(), *welded_vase()]
+
+
+def turned_lattices() -> list[Figure]:
+    """Return how much the lilium's closest shape hangs on the way its units lie: the flat turned under the lattice."""
+    mesh = published("lilium_tower")
+    if mesh is None:
+        return []
+    percents = []
+    for turn_deg in range(0, 60, 10):
+        layout, goal = tiled(mesh, 920, PRESCRIBED_MJ, "lilium_tower", np.deg2rad(turn_deg))
+        shapes, _ = equilibria(layout, goal, 0)
+        percents.append(min(100 * compared(layout, s.equilibrium, mesh, goal).deviation.mean_frac for s in shapes))
+    told = ", ".join(f"{p:.2f}" for p in percents)
+    return [Figure("lilium_tower, its flat turned by 0, 10, … 50°: the closest", told, "%", "reported", None, 6)]
 
 
 def welded_vase(count: int = 3400) -> list[Figure]:
@@ -359,22 +374,23 @@ def _gains(name: str, found: Compensation, before_mm: float, after_mm: float) ->
 
 
 def times() -> list[Figure]:
-    """Return CPU seconds from flat (one thread, SciPy alone), compiled code warm."""
+    """Return seconds from flat with SciPy alone, compiled code warm: by the clock, and processor time."""
     figures = []
     from_flat(cap(1.505, 10.0, PRESCRIBED_MJ)[0])
     seconds, counts = [], []
     for edge, limit in ((5.2, 2.0), (1.645, 10.0), (1.163, 25.0)):
         layout, _ = cap(1.505, edge, PRESCRIBED_MJ)
-        begin = time.process_time()
+        begin, worked = time.perf_counter(), time.process_time()
         found = from_flat(layout)
-        seconds.append(time.process_time() - begin)
+        seconds.append(time.perf_counter() - begin)
         counts.append(len(layout.cells))
-        figures.append(
-            most(f"from flat, {len(layout.cells)} units ({found.iterations_count} iterations)", seconds[-1], limit,
-                 "s CPU", f"≤ {limit:g} s", len(layout.cells))
-        )  # fmt: skip
+        name = f"from flat, {counts[-1]} units ({found.iterations_count} iterations)"
+        figures += [
+            most(name, seconds[-1], limit / 2, "s", f"≤ {limit:g} s, half of it with the optional solver", counts[-1]),
+            Figure(f"{name}: processor time", round(time.process_time() - worked, 3), "s", "", None, counts[-1]),
+        ]
     rate = float(np.polyfit(np.log(counts), np.log(seconds), 1)[0])
     return [
         *figures,
-        Figure("growth exponent", round(rate, 2), "", "growth near linear", bool(rate < 1.4), len(counts)),
+        Figure("growth exponent", round(rate, 2), "", "growth near linear", bool(rate < 1.2), len(counts)),
     ]

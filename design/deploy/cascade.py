@@ -158,8 +158,8 @@ def _pulled(
 ) -> tuple[Reals, Step, NDArray[np.bool_]]:
     """Return the sheet after one more unit was pulled open and those the hand is done with were let go."""
     kept = hand.held()
-    pulled = solve(System(_held_open(free.shell, [unit, *kept])), x, tolerance_ratio=TOLERANCE_RATIO)
-    rest = solve(System(_held_open(free.shell, kept)), pulled.x_mm, tolerance_ratio=TOLERANCE_RATIO)
+    pulled = solve(free.of(_held_open(free.shell, [unit, *kept])), x, tolerance_ratio=TOLERANCE_RATIO)
+    rest = solve(free.of(_held_open(free.shell, kept)), pulled.x_mm, tolerance_ratio=TOLERANCE_RATIO)
     now = share_of(free.shell, rest.x_mm) > wells.saddle_ratio
     others = np.arange(len(now)) != unit
     opened, closed = (np.flatnonzero(c & others).tolist() for c in (now & ~is_open, ~now & is_open))

@@ -146,10 +146,11 @@ def _sensitivity(layout: Layout, x: Reals, loads: Sequence[Load], fixed: NDArray
     """Return dx/dλ, `(3n, m)`, at rest."""
     system = System(layout.shell())
     hold = pins(x) if fixed is None else fixed
-    lu, _ = factorise(system.held(system.linearise(x, loads)[2], hold))
+    matrix = system.held(system.linearise(x, loads)[2], hold)
+    factor = system.cholesky(matrix, x) or factorise(matrix)[0]
     forces = force_derivative(layout, x).toarray()
     forces[hold.ravel()] = 0.0
-    return np.asarray(-lu.solve(forces))
+    return np.asarray(-factor.solve(forces))
 
 
 def force_derivative(layout: Layout, x: Reals) -> sp.csc_matrix:
@@ -157,13 +158,13 @@ def force_derivative(layout: Layout, x: Reals) -> sp.csc_matrix:
     m, n = len(layout.cells), layout.vertex_count
     reach = _reach(layout.cells, n)
     colours = _colours((reach @ reach.T).tocsr())
-    rows, cols, values = [], [], []
+    rows, cols, values, system = [], [], [], System(layout.shell())
     for colour in range(int(colours.max()) + 1):
         some = np.flatnonzero(colours == colour)
         nudge = np.zeros(m)
         nudge[some] = STEP_RATIO
         more, less = (
-            System(replace(layout, expansion_ratio=layout.expansion_ratio + sign * nudge).shell()).gradient(x)[1]
+            system.of(replace(layout, expansion_ratio=layout.expansion_ratio + sign * nudge).shell()).gradient(x)[1]
             for sign in (1, -1)
         )
         slope = (more - less) / (2 * STEP_RATIO)

@@ -72,6 +72,17 @@ def test_a_coarser_sheet_covers_the_finer_one(cap_of) -> None:
     )
 
 
+def test_a_finer_sheet_starts_on_the_curved_surface_not_on_its_facets(cap_of) -> None:
+    away = []
+    for edge_mm in (5.0, 2.5):
+        coarse, fine = cap_of(edge_mm=2 * edge_mm), cap_of(edge_mm=edge_mm)
+        start = prolong(coarse.layout, coarse.design_mm, fine.layout)
+        inside = np.linalg.norm(fine.layout.flat_mm(), axis=1) < 40
+        away.append(np.abs(np.linalg.norm(start[inside], axis=1) - 80).max())
+    assert away[0] < 0.1  # facets of 15 mm lie 0.35 mm within the sphere
+    assert np.log2(away[0] / away[1]) > 2.5  # facets would give 2
+
+
 def test_dividing_units_keeps_the_sheet_and_its_mean_expansion(cap) -> None:
     fine = refine(cap.layout, 3)
     lam = fine.expansion_ratio.reshape(-1, 9)
