@@ -14,7 +14,7 @@ import math
 import os
 import secrets
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from design.coupon import CELLS, Coupon, coupon_facts, coupon_texts
 from design.deploy.indentation import response_csv
 from design.errors import BundleError
 from design.export.dxf import dxf
@@ -31,15 +32,16 @@ from design.job import Job
 from design.meshfiles import write_ply
 from design.pattern.drawing import Drawing, as_json, from_json
 from design.pipeline import Design
-from design.preview import preview_png
+from design.preview import coupon_png, preview_png
 from design.surface import TriMesh
 
 FORMAT = 1
 ALWAYS = ("spec.yaml", "target.ply", "flat.ply", "cells.csv", "paths.json", "cut.dxf", "cut.svg", "cut.nc")
-ALSO = ("findings.json", "preview.png")
+COUPON = ("coupon.yaml", "cells.csv", "paths.json", "cut.dxf", "cut.svg", "cut.nc", "preview.png")
+NEEDED = {"design": ALWAYS, "coupon": COUPON}  # by the manifest's kind
+TO_FILL_IN = ("coupon.csv",)  # written on after the build, so its hash is not kept
 PREDICTED = ("deployed.ply", "response.csv")
 LIBRARIES = ("fabctl", "numpy", "scipy", "shapely", "ezdxf")
-COLUMNS = ("cell", "cx_mm", "cy_mm", "inverted", "t_mm", "theta_deg", "expansion_ratio", "hinge_mm", "kind")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +51,15 @@ class Bundle:
     path: Path
     manifest: Mapping[str, Any]
 
+    @property
+    def kind(self) -> str:
+        """Return "design", or "coupon" for a sheet of patches that has no target."""
+        return str(self.manifest.get("kind", "design"))
+
     def file(self, name: str) -> Path:
         """Return one of the folder's files; raise `BundleError` where this design has none of that name."""
         if name not in self.manifest["files"]:
-            raise BundleError(f"{self.path}: this design has no {name}")
+            raise BundleError(f"{self.path}: this {self.kind} has no {name}")
         return self.path / name
 
     def drawing(self, sheet: int | None = None) -> Drawing:
@@ -77,8 +84,12 @@ def open_bundle(path: Path) -> Bundle:
         raise BundleError(f"{path}: manifest.json cannot be read: {fault}") from fault
     if manifest.get("format") != FORMAT:
         raise BundleError(f"{path}: a design of format {manifest.get('format')!r}; this program reads {FORMAT}")
+    kind = str(manifest.get("kind", "design"))
+    if kind not in NEEDED:
+        raise BundleError(f"{path}: a folder of kind {kind!r}; this program reads {', '.join(NEEDED)}")
     found = [_fault(path / name, name, str(digest)) for name, digest in sorted(files.items())]
-    found += [Finding("BUNDLE-MISSING", "is not in the manifest", where=name) for name in ALWAYS if name not in files]
+    missing = [name for name in NEEDED[kind] if name not in files]
+    found += [Finding("BUNDLE-MISSING", "is not in the manifest", where=name) for name in missing]
     faults = [finding for finding in found if finding is not None]
     if faults:
         raise BundleError(f"{path}: not as it was built; build it again", faults)
@@ -100,14 +111,34 @@ def write_bundle(design: Design, spec_text: str, path: Path, replace: bool = Fal
 
     An existing folder is refused, unless it is empty, or `replace` is true and it holds a design.
     """
+    about = {"name": design.spec.name, "library": design.library_hash, "facts": facts(design)}
+    return _write_whole(path, replace, about, lambda draft: _write_files(design, spec_text, draft))
+
+
+def write_coupon_bundle(
+    made: Coupon, job: Job, spec_text: str, library_hash: str, edge_mm: float, path: Path
+) -> Bundle:
+    """Write a coupon's folder, which is cut as a design's is, and return it."""
+    about = {"name": "coupon", "kind": "coupon", "library": library_hash, "facts": coupon_facts(made, job, edge_mm)}
+
+    def fill(folder: Path) -> None:
+        texts = {**coupon_texts(made, job), "coupon.yaml": spec_text, "paths.json": _paths_text(made.drawing)}
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        (folder / "preview.png").write_bytes(coupon_png(made))
+
+    return _write_whole(path, False, about, fill)
+
+
+def _write_whole(path: Path, replace: bool, about: Mapping[str, Any], fill: Callable[[Path], None]) -> Bundle:
     if path.exists() and not _may_replace(path, replace):
         raise BundleError(f"{path}: exists already; choose another folder, or say that a design there may be replaced")
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     draft.mkdir()
     try:
-        _write_files(design, spec_text, draft)
-        _write_manifest(design, draft)
+        fill(draft)
+        _write_manifest(draft, about)
         if path.exists():
             shutil.rmtree(path)
         draft.rename(path)
@@ -146,11 +177,15 @@ def _write_files(design: Design, spec_text: str, folder: Path) -> None:
 
 def _cut_texts(suffix: str, drawing: Drawing, job: Job, title: str) -> dict[str, str]:
     return {
-        f"paths{suffix}.json": json.dumps(as_json(drawing), allow_nan=False) + "\n",
+        f"paths{suffix}.json": _paths_text(drawing),
         f"cut{suffix}.dxf": dxf(drawing.paths, drawing.size_mm),
         f"cut{suffix}.svg": svg(drawing.paths, drawing.size_mm, title),
         f"cut{suffix}.nc": "\n".join(job.lines) + "\n",
     }
+
+
+def _paths_text(drawing: Drawing) -> str:
+    return json.dumps(as_json(drawing), allow_nan=False) + "\n"
 
 
 def cells_csv(design: Design) -> str:
@@ -158,7 +193,7 @@ def cells_csv(design: Design) -> str:
     cells = design.cells
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(COLUMNS)
+    rows.writerow(CELLS)
     for k, (x, y) in enumerate(cells.tiling.centres_mm().tolist()):
         numbers = (
             cells.choice.t_mm[k],
@@ -171,19 +206,14 @@ def cells_csv(design: Design) -> str:
     return text.getvalue()
 
 
-def _write_manifest(design: Design, folder: Path) -> None:
+def _write_manifest(folder: Path, about: Mapping[str, Any]) -> None:
     files = {}
     for path in sorted(folder.iterdir()):
-        files[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        if path.name not in TO_FILL_IN:
+            files[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
         _sync(path)
-    body = {
-        "format": FORMAT,
-        "name": design.spec.name,
-        "files": files,
-        "library": design.library_hash,
-        "versions": {name: _version(name) for name in LIBRARIES},
-        "facts": facts(design),
-    }
+    versions = {name: _version(name) for name in LIBRARIES}
+    body = {"format": FORMAT, **about, "files": files, "versions": versions}
     path = folder / "manifest.json"
     path.write_text(json.dumps(body, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
     _sync(path)

@@ -25,7 +25,7 @@ from design.meshfiles import read_mesh
 from design.surface import TriMesh
 from fabctl.config.material import load_material
 from fabctl.config.spec import load_spec
-from fabctl.designing import library_of, sheet_of
+from fabctl.designing import library_file, library_of, sheet_of
 from fabctl.errors import RefusedError
 
 NUMBERS = ("cx_mm", "cy_mm", "inverted", "t_mm", "theta_deg", "expansion_ratio", "hinge_mm")
@@ -62,7 +62,7 @@ def read_laid(folder: Path, home: Path) -> Laid:
     flat = _flat_vertices(centre, inverted, edge_mm, shape)
     config, _ = load_spec(str(bundle.file("spec.yaml")), home)
     sheet = sheet_of(load_material(config.material, home), edge_mm)
-    library = library_of(config).scaled(sheet)
+    library = library_of(config, library_file(config, folder)).scaled(sheet)
     if config.cells == "expanding":
         library = with_hinge(library, float(np.median(table["hinge_mm"])))
     cells = library.at(t, theta)

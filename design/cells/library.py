@@ -135,6 +135,8 @@ class CellLibrary:
             raise LibraryError(f"no bistable cell at t = {t_mm:g} mm, θ = {math.degrees(theta_rad):g}°")
         stored_mm2 = float(self._read("stored_mm2", t_mm, theta_rad))
         rows, curves = self.table["curve_row"].astype(int), self.table["curve_mm2"]
+        if not len(rows):
+            raise LibraryError(f"{self.meta['command']} has no energy curves")
         away = np.hypot(
             (self.table["t_mm"][rows] - t_mm) / self.sheet.edge_mm, self.table["theta_rad"][rows] - theta_rad
         )
@@ -233,8 +235,12 @@ def save_library(path: Path, plan: Plan, sheet: Sheet, cells: Sequence[Cell], co
 
 @functools.lru_cache(maxsize=4)
 def load_library(path: Path | None = None) -> CellLibrary:
-    """Return the library in `path`; without one, the shipped library of the paper's sheet."""
+    """Return the library in `path`, an .npz or a published map as .csv; without one, the shipped library."""
     source = SHIPPED if path is None else path
+    if source.suffix.lower() == ".csv":
+        from design.cells.published_map import published_library
+
+        return published_library(source)
     try:
         with np.load(source) as file:
             table = {name: file[name] for name in file.files if name != "meta"}

@@ -27,9 +27,7 @@ FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.option("--image", type=FILE, help="A picture of the bed, instead of the bench's camera.")
 @bench_option
 @json_option
-@click.pass_context
 def inspect_command(
-    ctx: click.Context,
     specimen: str,
     thickness_mm: float | None,
     registration: Path | None,
@@ -42,7 +40,7 @@ def inspect_command(
     import numpy as np
 
     from fabctl.cli.camera import bed_picture, bench_and_state, read_paths
-    from fabctl.errors import OUT_OF_TOLERANCE
+    from fabctl.errors import DONE, OUT_OF_TOLERANCE
     from fabctl.vision import inspect as inspecting
     from fabctl.vision.bed import checked_alignment
     from fabctl.vision.overlay import inspection_on_bed, write_picture
@@ -79,9 +77,9 @@ def inspect_command(
         "findings": [finding.as_dict() for finding in findings],
     }
     text = ", ".join(f"{count} {state.replace('_', ' ')}" for state, count in counts.items() if count)
-    show(data, as_json, [f"{specimen}: {text}", f"{output}: what was seen", *map(str, findings)])
-    if any(finding.level == "error" for finding in findings):
-        ctx.exit(OUT_OF_TOLERANCE)
+    bad = any(finding.level == "error" for finding in findings)
+    lines = [f"{specimen}: {text}", f"{output}: what was seen", *map(str, findings)]
+    show(data, as_json, lines, OUT_OF_TOLERANCE if bad else DONE, f"{specimen} is not cut as designed: {text}")
 
 
 def _last_cut(specimen: str) -> RunFolder:

@@ -35,7 +35,7 @@ def command(
     bench_name: str,
     yes: bool,
     as_json: bool,
-) -> int:
+) -> None:
     """Take SPEC, a file or a name in configs/specs, through every room: design, cut, indent, scan, report.
 
     On a bench where a person deploys the sheet, flow stops after the cut with a checklist;
@@ -54,20 +54,21 @@ def command(
         assert spec is not None
         flow = steps_until_cut(home, order, find("specs", spec, home.root), target, run, emit)
         if bench.deployment == "by_hand":
-            return _wait_for_a_person(flow, order, as_json)
+            _wait_for_a_person(flow, order, as_json)
+            return
     flow = steps_after_deployment(order, flow, run, emit)
     report = flow.steps["report"]
     data = {"specimen": flow.specimen, "design": flow.design, **flow.steps}
     data |= {"verdict": report["verdict"], "sentence": report["sentence"], "report": report["report"]}
-    show(data, as_json, [f"{flow.specimen}: {report['sentence']}", f"report: {report['report']}"])
-    return OUT_OF_TOLERANCE if flow.out_of_tolerance else DONE
+    code = OUT_OF_TOLERANCE if flow.out_of_tolerance else DONE
+    lines = [f"{flow.specimen}: {report['sentence']}", f"report: {report['report']}"]
+    show(data, as_json, lines, code, report["sentence"])
 
 
-def _wait_for_a_person(flow: Flow, order: Order, as_json: bool) -> int:
+def _wait_for_a_person(flow: Flow, order: Order, as_json: bool) -> None:
     assert flow.specimen is not None
     lines = deployment_checklist(order.bench, flow.specimen)
     data = {"specimen": flow.specimen, "design": flow.design, **flow.steps, "next": list(lines)}
     show(data, as_json, [f"{flow.specimen} is cut. Now by hand:", *lines])
     if as_json:
         say(f"{flow.specimen} is cut. By hand now: {lines[-1]}")
-    return DONE

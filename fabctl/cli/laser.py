@@ -114,10 +114,13 @@ def unlock(bench_name: str, yes: bool, as_json: bool) -> None:
 @click.argument("y_mm", type=float)
 @click.option("--feed", "feed_mm_s", type=click.FloatRange(min=0.1), default=50.0, show_default=True, help="mm/s")
 @bench_option
+@yes_option
 @json_option
-def jog(x_mm: float, y_mm: float, feed_mm_s: float, bench_name: str, as_json: bool) -> None:
+def jog(x_mm: float, y_mm: float, feed_mm_s: float, bench_name: str, yes: bool, as_json: bool) -> None:
     """Move the head by X_MM, Y_MM with the beam off; Ctrl-C stops it."""
     with _laser(bench_name, "jogging") as (laser, _):
+        if not confirm(f"The head will move by X{x_mm:+g} Y{y_mm:+g} mm at {feed_mm_s:g} mm/s. Is the way free?", yes):
+            raise click.Abort
         laser.jog(x_mm, y_mm, feed_mm_s)
         report = laser.report()
     show(_facts(report), as_json, [_place(report)])

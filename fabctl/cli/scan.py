@@ -84,7 +84,7 @@ def run_scan(
     seed: int,
     bench_name: str,
     as_json: bool,
-) -> int:
+) -> None:
     """Compare CLOUD with the target of SPECIMEN, or with --target.
 
     Without CLOUD the bench's scanner is asked for one. Exit code 3: no pose, or more than one; 6: out of tolerance.
@@ -117,11 +117,12 @@ def run_scan(
     }
     if cloud is not None:
         request = Request(cloud, mesh, predicted if predicted and predicted.is_file() else None, **options)
-        return _run(here, request, specimen, as_json)
+        _run(here, request, specimen, as_json)
+        return
     if specimen is None:
         raise UsageError("give the cloud's file")
     fresh = _fetch(here, bench_name, specimen, seed)
-    return _run(here, Request(fresh, mesh, predicted, **options), specimen, as_json)
+    _run(here, Request(fresh, mesh, predicted, **options), specimen, as_json)
 
 
 @command.command("batch")
@@ -140,7 +141,7 @@ def run_batch(
     tolerance_frac: float | None,
     seed: int,
     as_json: bool,
-) -> int:
+) -> None:
     """Compare many CLOUDS with one target; a run record each. The exit code is that of the worst."""
     from fabctl.scan.job import Request
 
@@ -163,8 +164,8 @@ def run_batch(
     lines = [
         f"{Path(r['cloud']).name:32} {r['verdict']:18} {r.get('rms_mm') or float('nan'):9.3f} mm rms" for r in rows
     ]
-    show({"scans": rows}, as_json, lines)
-    return worst
+    off = sum(row["exit_code"] != 0 for row in rows)
+    show({"scans": rows}, as_json, lines, worst, f"{off} of {len(rows)} scans did not pass")
 
 
 @command.command("compare")
@@ -259,13 +260,12 @@ def _newest(inbox: Path) -> Path:
     return max(found, key=lambda p: p.stat().st_mtime)
 
 
-def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: bool) -> int:
+def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: bool) -> None:
     """Compare, write the run record, show the result; return the exit code."""
     run, body, code = _compared(here, request, specimen)
     page = run.artefact("report.html")
     data = {"run": run.run_id, "folder": str(run.path), "report": str(page), **body}
-    show(data, as_json, _lines(body, page))
-    return code
+    show(data, as_json, _lines(body, page), code, _sentence(body))
 
 
 def _compared(here: Workspace, request: Request, specimen: Specimen | None) -> tuple[RunFolder, dict[str, Any], int]:

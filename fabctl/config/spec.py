@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -43,8 +43,9 @@ class MadeTarget(Model):
 
 
 class FlattenConfig(Model):
-    """How the surface is laid flat."""
+    """How the surface is laid flat; with `source: target` the OBJ's own texture coordinates are its flat, in mm."""
 
+    source: Literal["computed", "target"] = "computed"
     boundary: Boundary = "isometric"
     modes_count: Count = 24
     seam: SeamChoice = "auto"
@@ -54,6 +55,12 @@ class FlattenConfig(Model):
     def _no_values_here(self) -> FlattenConfig:
         if self.boundary == "prescribed":
             raise ValueError("a prescribed boundary needs values per vertex; it is for programs, not for this file")
+        return self
+
+    @model_validator(mode="after")
+    def _given_is_taken_as_it_is(self) -> FlattenConfig:
+        if self.source == "target" and self.model_fields_set != {"source"}:
+            raise ValueError("`source: target` takes the file's flat as it is; no other key of `flatten` applies")
         return self
 
 
@@ -177,7 +184,7 @@ class SpecConfig(Model):
             name=self.name,
             cells=self.cells,
             cell_mm=cell_mm,
-            flatten=FlattenOptions(**self.flatten.model_dump()),
+            flatten=FlattenOptions(**self.flatten.model_dump(exclude={"source"})),
             infeasible=self.infeasible,
             averaging=self.averaging,
             scale=ScaleOptions(self.scale.end, self.scale.high_ratio),

@@ -183,6 +183,9 @@ def check(
                 "METHOD-FORCE",
                 f"the method's limit {method.limits.force_N:g} N is above the bench's {rig.force_limit_N:g} N",
                 where="limits.force_N",
+                value=method.limits.force_N,
+                unit="N",
+                limit=rig.force_limit_N,
             )
         )
     if method.limits.travel_mm > rig.travel_mm:
@@ -191,6 +194,9 @@ def check(
                 "METHOD-TRAVEL",
                 f"the method's travel {method.limits.travel_mm:g} mm is longer than the rig's {rig.travel_mm:g} mm",
                 where="limits.travel_mm",
+                value=method.limits.travel_mm,
+                unit="mm",
+                limit=rig.travel_mm,
             )
         )
     if any(action.kind == "travel" for action in plan) and not has_stage:
@@ -202,6 +208,9 @@ def check(
                     "METHOD-STEP-FORCE",
                     f"{action.kind} to {action.force_N:g} N reaches the limit of {method.limits.force_N:g} N",
                     hint="the limit acts on the untared force; leave room",
+                    value=action.force_N,
+                    unit="N",
+                    limit=method.limits.force_N,
                 )
             )
     deepest = max((a.depth_mm for a in plan if a.kind == "load" and a.depth_mm is not None), default=None)
@@ -220,6 +229,9 @@ def _against(predicted: Predicted, deepest_mm: float, method: MethodConfig, rig:
             f"pressed to {deepest_mm:g} mm the specimen is predicted to answer with {peak_N:.2f} N, "
             f"the limit is {method.limits.force_N:g} N",
             hint="load less deep, or raise limits.force_N",
+            value=peak_N,
+            unit="N",
+            limit=method.limits.force_N,
         )
     if deepest_mm > predicted.depth_mm[-1]:
         yield Finding(

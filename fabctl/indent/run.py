@@ -14,10 +14,10 @@ from typing import Literal, Protocol
 import numpy as np
 
 from design.findings import Finding
+from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.rig.indenter import LOST, Indenter, Limits, RigFaulted, ended
 from drivers.rig.samples import Restarted, Sample
-from fabctl.clock import Clock
 from fabctl.config.method import MethodConfig
 from fabctl.errors import FabctlError, RefusedError, Stopped
 from fabctl.events import Emit, Event, silent

@@ -20,6 +20,7 @@ from fabctl.vision.template import (
     Fit,
     correlation,
     fit,
+    fitting_blur_px,
     homography,
     look,
     module_px,
@@ -33,9 +34,15 @@ Family = Literal["5x5_250", "mip_36h12"]
 FAMILIES: dict[Family, str] = {"5x5_250": "DICT_5X5_250", "mip_36h12": "DICT_ARUCO_MIP_36h12"}
 ACCEPT_RATIO = 0.80  # correlation of the whole picture, frame and margin included
 MARGIN_RATIO = 0.06  # by how much the best code must beat the second
-CODE_RATIO = 0.55  # correlation of the code's modules alone, where frame and margin no longer help
+CODE_RATIO = 0.70  # correlation of the code's modules alone, where frame and margin no longer help
+SCREEN_CODE_RATIO = 0.55  # correlation of the whole picture, before anything is fitted
 WRONG_MODULE = 0.6  # of what a module of the other colour would show; one such makes it another marker
 HOPELESS_RATIO = 0.6  # no change of blur brings a first fit below this to ACCEPT_RATIO
+# What a quick first fit must show at least. Of markers at the limits of what is read the worst showed 0.95, 0.89, 0.12
+# and 0.34: the whole, the code alone, its lead over other codes, the worst module.
+SKETCH_RATIO, SKETCH_CODE_RATIO, SKETCH_LEAD_RATIO, SKETCH_WRONG_MODULE = 0.65, 0.5, -0.05, 1.5
+SKETCH_STEPS = 8
+SAME_QUAD_RATIO = 0.02  # of the side: nearer outlines are one and the same
 SCREEN_RATIO = 0.45  # correlation with the bare frame that a quadrilateral needs to be looked at further
 BLURS_px = (0.5, 0.9, 1.4, 2.0, 3.0)
 COARSE_PER_MODULE = 3
@@ -92,10 +99,13 @@ def find_markers(
     """
     grey = np.ascontiguousarray(image, dtype=np.float64)
     found: dict[int, Marker] = {}
+    refused: list[F64] = []
     for quad in _quadrilaterals(image, family, upscale, inverted, smallest_px):
-        if any(_same_place(quad, marker) for marker in found.values()):
+        if any(_same_place(quad, marker) for marker in found.values()) or _among(quad, refused):
             continue  # OpenCV proposes the same outline once for each of its thresholds
         marker = read_quadrilateral(grey, quad, family, inverted)
+        if marker is None:
+            refused.append(quad)
         if marker and (marker.id not in found or found[marker.id].score_ratio < marker.score_ratio):
             found[marker.id] = marker
     return [found[k] for k in sorted(found)]
@@ -104,6 +114,13 @@ def find_markers(
 def _same_place(quad: F64, marker: Marker) -> bool:
     side = float(np.linalg.norm(marker.corners_px[1] - marker.corners_px[0]))
     return bool(np.abs(quad.mean(axis=0) - marker.centre_px).max() < 0.15 * side)
+
+
+def _among(quad: F64, refused: list[F64]) -> bool:
+    if not refused:
+        return False
+    side = float(np.linalg.norm(quad[1] - quad[0]))
+    return bool((np.abs(np.array(refused) - quad).max(axis=(1, 2)) < SAME_QUAD_RATIO * side).any())
 
 
 def mirrored(image: NDArray[np.uint8], family: Family = "5x5_250") -> list[Marker]:
@@ -125,12 +142,12 @@ def read_quadrilateral(grey: F64, quad: F64, family: Family, inverted: bool = Fa
     seen = seen - seen.mean()
     seen /= max(float(np.linalg.norm(seen)), 1e-9)
     best: tuple[float, int, float] | None = None
-    for blur_px in BLURS_px:
-        scores = _templates(family, _level(blur_px / size_px)) @ seen
+    for level, blur_px in {_level(blur_px / size_px): blur_px for blur_px in reversed(BLURS_px)}.items():
+        scores = _templates(family, level) @ seen
         k = int(np.argmax(np.abs(scores) if inverted else scores))
         if best is None or abs(scores[k]) > best[0]:
             best = (abs(float(scores[k])), k, blur_px)
-    if best is None or best[0] < CODE_RATIO:
+    if best is None or best[0] < SCREEN_CODE_RATIO:
         return None
     return _refined(grey, H, family, best[1], best[2], inverted)
 
@@ -140,7 +157,10 @@ def _refined(grey: F64, H: F64, family: Family, k: int, blur_px: float, inverted
     number, turns = divmod(k, 4)
     turned = H @ _quarter_turns(turns)
     bits = codes(family)[number]
-    found = _best_blur(grey, bits, turned / turned[2, 2], blur_px)
+    sketch = fit(grey, bits, turned / turned[2, 2], blur_px, SKETCH_STEPS, COARSE_PER_MODULE)
+    if sketch is None or not _may_be(grey, sketch, family, number):
+        return None
+    found = _best_blur(grey, bits, sketch.H, blur_px)
     if found is None or found.score_ratio < (-1 if inverted else ACCEPT_RATIO) or abs(found.score_ratio) < ACCEPT_RATIO:
         return None
     if not _stands_out(grey, found, family, number) or worst_module(grey, bits, found) > WRONG_MODULE:
@@ -150,32 +170,42 @@ def _refined(grey: F64, H: F64, family: Family, k: int, blur_px: float, inverted
 
 
 def _best_blur(grey: F64, bits: F64, H: F64, blur_px: float) -> Fit | None:
-    best = fit(grey, bits, H, blur_px)
+    """Fit place and blur in turn: neither moves the other much."""
+    best = fit(grey, bits, H, fitting_blur_px(grey, bits, H, blur_px))
     if best is None or abs(best.score_ratio) < HOPELESS_RATIO:
         return None
-    for direction in (0.7, 1.4):
-        trial = blur_px
-        while True:
-            trial *= direction
-            other = fit(grey, bits, best.H, trial, steps=4)
-            if other is None or other.score_ratio <= best.score_ratio + 1e-4 or not 0.1 < trial < 20:
-                break
-            best = other
-    return fit(grey, bits, best.H, best.blur_px)
+    blur_px = fitting_blur_px(grey, bits, best.H, best.blur_px)
+    return best if blur_px == best.blur_px else fit(grey, bits, best.H, blur_px) or best
+
+
+def _may_be(grey: F64, sketch: Fit, family: Family, number: int) -> bool:
+    """Say whether a quick first fit is worth the full one; nearly all that is no marker ends here."""
+    if abs(sketch.score_ratio) < SKETCH_RATIO:
+        return False
+    own, lead = _code_scores(grey, sketch, family, number)
+    if own < SKETCH_CODE_RATIO or lead < SKETCH_LEAD_RATIO:
+        return False
+    return worst_module(grey, codes(family)[number], sketch) <= SKETCH_WRONG_MODULE
 
 
 def _stands_out(grey: F64, found: Fit, family: Family, number: int) -> bool:
     """Say whether the code's own modules fit, and no other id fits nearly as well."""
+    own, lead = _code_scores(grey, found, family, number)
+    return own >= CODE_RATIO and lead >= MARGIN_RATIO
+
+
+def _code_scores(grey: F64, found: Fit, family: Family, number: int) -> tuple[float, float]:
+    """Return the correlation of the code's own modules, and by how much it beats that of any other id."""
     modules = codes(family).shape[1]
     places = sample_grid(modules, COARSE_PER_MODULE)
     grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
-    seen = look(grey, warp(found.H, grid))
     level = _level(found.blur_px / math.sqrt(math.prod(module_px(found.H, modules))))
     inner = np.abs(grid).max(axis=1) < 1 - 2 / modules
-    scores = np.abs(_inner_templates(family, level) @ _unit(seen[inner]))
-    own = float(scores.reshape(-1, 4)[number].max())
-    others = np.delete(scores.reshape(-1, 4), number, axis=0).max()
-    return own >= CODE_RATIO and own >= float(others) + MARGIN_RATIO
+    seen = look(grey, warp(found.H, grid[inner]))
+    scores = np.abs(_inner_templates(family, level) @ _unit(seen)).reshape(-1, 4).max(axis=1)
+    own = float(scores[number])
+    scores[number] = -1.0
+    return own, own - float(scores.max())
 
 
 def _unit(values: F64) -> F64:

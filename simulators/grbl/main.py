@@ -12,7 +12,7 @@ from types import FrameType
 
 from simulators.clock import Clock
 from simulators.endpoints import PtyEndpoint, TcpEndpoint
-from simulators.faults import KINDS, Fault
+from simulators.faults import KINDS, SLOW_S, Fault
 from simulators.grbl.board import Board, Point
 from simulators.grbl.dialects import DIALECTS
 from simulators.grbl.machine import Machine, World
@@ -104,6 +104,9 @@ def _spoil(fault: Fault, out: bytes, now_s: float, board: Board, endpoint: PtyEn
     if fault.restart:
         fault.restart = False
         board.restart()
+    if fault.crawl:
+        fault.crawl = False
+        board.machine.stepper.linger_s = SLOW_S
     if fault.unplug:
         fault.unplug = False
         endpoint.exchange(out, 0.0)
