@@ -12,6 +12,7 @@ from design.cells.bending_map import load_bending
 from design.cells.library import load_library
 from design.cells.select import SelectionOptions, on_curve, selection_curve
 from design.cells.sheet import Sheet
+from design.deploy.compare import surface_samples
 from design.deploy.designed import designed_layout, lift
 from design.deploy.levels import Layout, sheet_layout
 from design.flatten import Flattening, flatten
@@ -56,6 +57,25 @@ def cap(apex: float, edge_mm: float, D_mJ: float | None = None) -> tuple[Layout,
     polar, turn = 2 * np.arctan(np.hypot(*flat.T) / reach), np.arctan2(flat[:, 1], flat[:, 0])
     goal = CAP_MM * np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
     return layout, goal
+
+
+def sphere_deviation_mm(x: Reals, layout: Layout) -> tuple[float, Reals]:
+    """Return the mean distance of the units from the sphere fitted with its own radius, and the shape about it."""
+    from scipy.optimize import least_squares
+
+    points, area = surface_samples(x, layout.cells)
+
+    def gap(centre: Reals) -> Reals:
+        return np.asarray((np.linalg.norm(points - centre, axis=1) - CAP_MM) * np.sqrt(area))
+
+    centre = least_squares(gap, x.mean(axis=0) - [0, 0, 60]).x
+    return float(np.average(np.abs(np.linalg.norm(points - centre, axis=1) - CAP_MM), weights=area)), x - centre
+
+
+def sphere_rms_mm(x: Reals, layout: Layout, aligned: bool) -> float:
+    """Return the RMS distance of the vertices from the target's sphere, about its own centre or the best one."""
+    about = sphere_deviation_mm(x, layout)[1] if aligned else x
+    return float(np.sqrt(np.mean((np.linalg.norm(about, axis=1) - CAP_MM) ** 2)))
 
 
 def shared_folder() -> Path:

@@ -25,6 +25,8 @@ from benchmarks._deploy_cases import (
     cap,
     properties,
     published,
+    sphere_deviation_mm,
+    sphere_rms_mm,
     tiled,
     tiled_vase,
     whole_vase,
@@ -33,13 +35,14 @@ from design.cells.library import load_library
 from design.deploy.compensate import Compensation, compensate
 from design.deploy.equilibrium import from_flat, rolled, solve_level
 from design.deploy.factor import factorise
-from design.deploy.indentation import Response, border, indentation_response
+from design.deploy.indentation import Response, indentation_response
 from design.deploy.levels import Layout
-from design.deploy.newton import System, pins, solve
+from design.deploy.newton import System, pins
 from design.deploy.predict import compared
 from design.deploy.search import equilibria
 from design.deploy.shell import Shell, build_shell
-from design.deploy.supports import settle, weight_of
+from design.deploy.standing import standing
+from design.deploy.supports import Support, settle
 from design.pattern.tiling import tile
 from design.surface import TriMesh
 
@@ -62,21 +65,6 @@ def measure(words: list[str]) -> list[Figure]:
 def most(name: str, value: float, limit: float, unit: str, target: str, n: int) -> Figure:
     """Return a figure that must not exceed its limit."""
     return Figure(name, round(float(value), 12), unit, target, bool(value <= limit), n)
-
-
-def sphere_deviation_mm(x: Reals, layout: Layout) -> tuple[float, Reals]:
-    """Return the mean distance of the units from the sphere fitted with its own radius, and the shape about it."""
-    from scipy.optimize import least_squares
-
-    from design.deploy.compare import surface_samples
-
-    points, area = surface_samples(x, layout.cells)
-
-    def gap(centre: Reals) -> Reals:
-        return np.asarray((np.linalg.norm(points - centre, axis=1) - CAP_MM) * np.sqrt(area))
-
-    centre = least_squares(gap, x.mean(axis=0) - [0, 0, 60]).x
-    return float(np.average(np.abs(np.linalg.norm(points - centre, axis=1) - CAP_MM), weights=area)), x - centre
 
 
 def derivatives() -> list[Figure]:
@@ -352,13 +340,15 @@ def compensation() -> list[Figure]:
         found = compensate(layout, goal, bounds)
         after = compared(found.layout, found.equilibrium, mesh, goal).deviation
         figures += _gains("double_dome", found, before.rms_mm, after.rms_mm)
-    layout, goal = cap(1.6, 10.0)
-    loads = [weight_of(layout, SHEET)]
-    rim = np.repeat(border(layout.cells, layout.vertex_count)[:, None], 3, axis=1)
-    heavy = solve(System(layout.shell()), goal, loads, rim)
-    found = compensate(layout, goal, bounds, loads=loads, fixed=rim)
-    rms = [float(np.sqrt(np.mean((np.linalg.norm(e.x_mm, axis=1) - CAP_MM) ** 2))) for e in (heavy, found.equilibrium)]
-    return [*figures, *_gains("heavy cap, rim held at its place", found, *rms)]
+    supports: tuple[Support, ...] = ("held", "no-slip")
+    for support in supports:
+        layout, goal = cap(1.6, 10.0)
+        held = standing(layout, goal, SHEET, support)
+        heavy = solve_level(layout, goal, held.loads, held.fixed)
+        found = compensate(layout, goal, bounds, standing=held)
+        rms = [sphere_rms_mm(e.x_mm, layout, held.aligned) for e in (heavy, found.equilibrium)]
+        figures += _gains(f"heavy cap, rim {support}", found, *rms)
+    return figures
 
 
 def _gains(name: str, found: Compensation, before_mm: float, after_mm: float) -> list[Figure]:

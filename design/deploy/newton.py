@@ -256,10 +256,9 @@ def _line_search(
     return 0.0
 
 
-def lowest_modes(matrix: sp.csc_matrix, count: int = 1) -> tuple[Reals, Reals]:
+def lowest_modes(matrix: sp.csc_matrix, count: int = 1, factor: Factor | None = None) -> tuple[Reals, Reals]:
     """Return the eigenvalues nearest below or around zero, ascending, N/mm, and their vectors `(3n, count)`."""
-    lu = factorise(matrix)[0]
-    inverse = LinearOperator(matrix.shape, matvec=lu.solve, dtype=float)
+    inverse = LinearOperator(matrix.shape, matvec=(factor or factorise(matrix)[0]).solve, dtype=float)
     start = np.random.default_rng(7).standard_normal(matrix.shape[0])
     values, vectors = eigsh(matrix, k=count, sigma=0.0, OPinv=inverse, v0=start, which="LM")
     order = np.argsort(values)
@@ -280,7 +279,7 @@ def smallest_eigenvalue_N_mm(
     """Return the smallest eigenvalue in magnitude of the Hessian on the free degrees of freedom (signed)."""
     hold = pins(x_mm) if fixed is None else fixed
     matrix = system.held(system.linearise(x_mm, loads)[2], hold)
-    return float(lowest_modes(matrix, 1)[0][0])
+    return float(lowest_modes(matrix, 1, system.cholesky(matrix, x_mm))[0][0])
 
 
 def fold_angles(x_mm: Reals, hinges: Ints) -> Reals:

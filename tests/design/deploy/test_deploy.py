@@ -106,6 +106,9 @@ def test_a_pressed_cap_pushes_back_and_recovers(cap, popped) -> None:
     assert np.all(np.diff(response.load_N) > 0)
     assert response.residual_ratio < 1e-8
     assert response.recovered_mm < 1e-6
+    assert response.iterations_count > 8
+    assert response.unstable_count == 0
+    assert response.smallest_eigenvalue_N_mm > 0
     assert response.unload_N == pytest.approx(response.load_N, abs=1e-6)
     stiffer = cap.layout.__class__(
         **{**{f: getattr(cap.layout, f) for f in cap.layout.__slots__}, "D_mJ": 4 * cap.layout.D_mJ}
