@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from dataclasses import replace as changed
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import yaml
@@ -25,7 +26,7 @@ from design.meshfiles import read_given_flat, read_mesh
 from design.pattern.paths import Layer, LayerPreset
 from design.pattern.toolpath import ToolOptions
 from design.pipeline import Design, build
-from design.spec import DesignSpec, Kind
+from design.spec import DesignSpec, Kind, Rim
 from design.surface import TriMesh
 from design.targets import TARGETS
 from fabctl.config.bench import names
@@ -168,8 +169,12 @@ def build_folder(
     return design, bundle
 
 
-def build_compensated(bundle: Bundle, folder: Path, home: Path, emit: Emit = silent) -> tuple[Design, Finding]:
+def build_compensated(
+    bundle: Bundle, folder: Path, home: Path, emit: Emit = silent, rim: Literal[True] | Rim = True
+) -> tuple[Design, Finding]:
     """Build a design folder anew with compensated expansions; raise `RefusedError` where they do not help.
+
+    `rim` says on what the sheet bears its weight; True: it is free of both.
 
     The specification kept in the new folder asks for the compensation itself, so that it can be built from there.
     """
@@ -177,11 +182,11 @@ def build_compensated(bundle: Bundle, folder: Path, home: Path, emit: Emit = sil
     spec_path, target = bundle.file("spec.yaml"), bundle.file("target.ply")
     cell_mm = bundle.manifest["facts"].get("cell_mm")  # the command line may have asked for other cells than the file
     inputs = read_inputs(str(spec_path), home, target, cell_mm)
-    design = design_of(changed(inputs, spec=changed(inputs.spec, compensate=True)), emit)
+    design = design_of(changed(inputs, spec=changed(inputs.spec, compensate=rim)), emit)
     told = next((f for f in design.findings if f.code in ("COMPENSATED", "COMPENSATE-NOT")), None)
     if told is None or told.code == "COMPENSATE-NOT":
         raise RefusedError("the design was not compensated", [told] if told else [])
-    text = re.sub(r"(?m)^compensate:.*\n", "", inputs.text).rstrip("\n") + "\ncompensate: true\n"
+    text = re.sub(r"(?m)^compensate:.*\n", "", inputs.text).rstrip("\n") + f"\ncompensate: {str(rim).lower()}\n"
     write_bundle(design, text, folder)
     return design, told
 
