@@ -41,9 +41,26 @@ def test_cell_gives_numbers_slits_and_a_picture(tmp_path: Path) -> None:
     assert "</svg>" in picture.read_text()
 
 
-def test_a_cell_that_is_not_bistable_says_why(tmp_path: Path) -> None:
-    told = json.loads(run("cell", "--t-mm", "3", "--theta-deg", "0", "--json", home=tmp_path).stdout)
-    assert told["verdict"] == "not bistable" and told["reason"] and told["expansion_ratio"] is None
+@pytest.mark.parametrize(
+    ("t_mm", "theta_deg", "verdict"), [("3", "0", "not bistable"), ("-1", "0", "invalid"), ("1", "90", "invalid")]
+)
+def test_what_is_no_bistable_cell_says_why_and_ends_with_3(
+    t_mm: str, theta_deg: str, verdict: str, tmp_path: Path
+) -> None:
+    words = ("cell", "--t-mm", t_mm, "--theta-deg", theta_deg)
+    picture = tmp_path / "states.svg"
+    result = run(*words, "-o", str(picture), "--json", home=tmp_path)
+    told = json.loads(result.stdout)
+    assert result.exit_code == run(*words, home=tmp_path).exit_code == 3
+    assert told["verdict"] == verdict and told["reason"] and told["expansion_ratio"] is None
+    assert not picture.exists()
+
+
+def test_a_cell_for_a_person_has_the_digits_it_has(tmp_path: Path) -> None:
+    result = run("cell", "--t-mm", "1.2", "--theta-deg", "3", home=tmp_path)
+    assert result.exit_code == 0
+    assert "expansion_ratio: 1.5263\n" in result.stdout
+    assert max(len(line) for line in result.stdout.splitlines()) < 100
 
 
 def test_plot_draws_the_maps(tmp_path: Path) -> None:
@@ -91,10 +108,10 @@ def test_compare_names_the_rows_without_a_cell_and_why(tmp_path: Path) -> None:
     assert "row 2" in run("compare", str(table), "--jobs", "1", home=tmp_path).stdout
 
 
-def test_show_says_how_many_second_states_are_left_out_of_the_range(tmp_path: Path) -> None:
+def test_show_says_how_many_cells_were_decided_on_the_finer_mesh(tmp_path: Path) -> None:
     told = json.loads(run("show", "--json", home=tmp_path).stdout)
     assert told["shallow_count"] == 28
-    assert "28 more" in run("show", home=tmp_path).stdout
+    assert "28 of them were decided at half the mesh size" in run("show", home=tmp_path).stdout
 
 
 def test_the_command_loads_no_numpy_before_it_has_asked_for_one_thread() -> None:
