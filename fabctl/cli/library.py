@@ -15,6 +15,7 @@ from fabctl.cli.common import json_option, lab, progress, say, show
 from fabctl.cli.finite import PictureFile
 
 if TYPE_CHECKING:
+    from design.cells.calibrate import Loading
     from design.cells.compare import Comparison, Unanswered
     from design.cells.homogenise import Cell, Failure
     from design.cells.library import CellLibrary
@@ -115,16 +116,14 @@ def _progress() -> Any:
 def _summary(library: CellLibrary) -> dict[str, Any]:
     low, high = library.range_ratio()
     return {
-        "cells_count": len(library),
-        "range_ratio": [low, high],
-        "spread_ratio": high / low,
+        "cells_count": len(library), "range_ratio": [low, high], "spread_ratio": high / low,
         "candidates": library.counts(),
         "reasons": library.reasons(),
         "shallow_count": len(library.shallow_cells()[0]),
         "sheet": asdict(library.sheet),
         "hash": library.hash,
         "command": library.meta["command"],
-    }
+    }  # fmt: skip
 
 
 def _lines(library: CellLibrary) -> Iterator[str]:
@@ -358,18 +357,23 @@ def _finite(value: Any) -> Any:
 @command.command()
 @click.argument("measured", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.argument("response", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--point", type=int, help="Which of MEASURED's points, where it has several.")
+@click.option("--curve", type=int, help="Which curve of that point [the last].")
 @material_option
 @json_option
-def calibrate(measured: Path, response: Path, material: str, as_json: bool) -> None:
-    """Find E·thickness: MEASURED (depth_mm, load_N) against the RESPONSE.csv predicted for the same specimen."""
+def calibrate(
+    measured: Path, response: Path, point: int | None, curve: int | None, material: str, as_json: bool
+) -> None:
+    """Find E·thickness: MEASURED (a run's curves.csv) against the RESPONSE.csv predicted for the same specimen."""
     from design.cells.calibrate import calibrate as fit
 
     sheet = _sheet(material)
-    depth, force = _curve(measured)
-    found = fit(depth, force, *_curve(response))
+    loading, model = _loading(measured, point, curve), _loading(response)
+    found = fit(loading.depth_mm, loading.force_N, model.depth_mm, model.force_N)
     stretch = sheet.E_MPa * sheet.thickness_mm
     result = {
         **asdict(found),
+        "curve": loading.name,
         "E_thickness_N_mm": found.factor_ratio * stretch,
         "E_thickness_ci95_N_mm": found.factor_ci95_ratio * stretch,
         "E_MPa": found.factor_ratio * sheet.E_MPa,
@@ -379,26 +383,17 @@ def calibrate(measured: Path, response: Path, material: str, as_json: bool) -> N
         f"(the material file says {stretch:.4g})",
         f"at {sheet.thickness_mm:g} mm: E_MPa: {result['E_MPa']:.4g}",
         f"contact at {found.contact_mm:.3f} mm, misfit {found.misfit_ratio:.1%} of the greatest force, "
-        f"{found.samples_count} samples",
+        f"{found.samples_count} samples" + (f" of {loading.name}" if loading.name else ""),
     ]
     show(result, as_json, lines)
 
 
-def _curve(path: Path) -> tuple[Any, Any]:
-    """Return depth_mm and load_N (or force_N) of a CSV with a header; lines that begin with # are passed over."""
-    import csv
-
-    import numpy as np
-
+def _loading(path: Path, point: int | None = None, curve: int | None = None) -> Loading:
+    from design.cells.calibrate import read_loading
+    from design.errors import DesignError
     from fabctl.errors import UsageError
 
-    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
-    rows = list(csv.DictReader(lines))
-    force = next((name for name in ("load_N", "force_N") if rows and name in rows[0]), None)
-    if force is None or "depth_mm" not in rows[0]:
-        raise UsageError(f"{path}: needs the columns depth_mm and load_N (or force_N)")
     try:
-        pairs = np.array([[float(row["depth_mm"]), float(row[force])] for row in rows if row[force]])
-    except ValueError as fault:
+        return read_loading(path.read_text(encoding="utf-8"), point, curve)
+    except (DesignError, UnicodeDecodeError) as fault:
         raise UsageError(f"{path}: {fault}") from fault
-    return pairs[:, 0], pairs[:, 1]

@@ -141,6 +141,43 @@ def test_calibrate_finds_the_modulus_of_a_stiffer_sheet(tmp_path: Path) -> None:
     assert told["E_thickness_N_mm"] == pytest.approx(1.6 * 1.5 * 2.3, rel=0.01)
 
 
+def rig_curves(folder: Path, points: int = 1) -> tuple[Path, Path]:
+    """Write a run's curves.csv, whose first loading is stiffer and whose unloading is softer, and its prediction."""
+    depth = np.linspace(0, 4, 81)
+    predicted = 0.3 * depth + 0.05 * depth**2
+    factors = [(1, "load", 2.0), (1, "unload", 1.0), (2, "load", 1.6), (2, "unload", 0.9)]
+    rows = [
+        f"{point},{curve},{branch},{d:.4f},{factor * f:.5f}"
+        for point in range(points)
+        for curve, branch, factor in factors
+        for d, f in zip(depth, predicted, strict=True)
+    ]
+    measured, response = folder / "curves.csv", folder / "response.csv"
+    measured.write_text("\n".join(["point,curve,branch,depth_mm,force_N", *rows]) + "\n")
+    told = "\n".join(f"{d},{f}" for d, f in zip(depth, predicted, strict=True))
+    response.write_text(f"depth_mm,load_N\n{told}\n")
+    return measured, response
+
+
+@pytest.mark.parametrize(("options", "factor"), [((), 1.6), (("--curve", "1"), 2.0)])
+def test_a_rigs_curves_are_calibrated_by_one_loading_alone(
+    options: tuple[str, ...], factor: float, tmp_path: Path
+) -> None:
+    measured, response = rig_curves(tmp_path)
+    told = json.loads(run("calibrate", str(measured), str(response), *options, "--json", home=tmp_path).stdout)
+    assert told["factor_ratio"] == pytest.approx(factor, rel=1e-3)
+    assert told["misfit_ratio"] < 1e-3 and told["curve"].startswith("point 0, curve")
+
+
+def test_of_several_points_one_must_be_named(tmp_path: Path) -> None:
+    measured, response = rig_curves(tmp_path, points=2)
+    assert "points 0, 1" in str(run("calibrate", str(measured), str(response), home=tmp_path).exception)
+    told = run("calibrate", str(measured), str(response), "--point", "1", "--json", home=tmp_path).stdout
+    assert json.loads(told)["factor_ratio"] == pytest.approx(1.6, rel=1e-3)
+    result = run("calibrate", str(measured), str(response), "--point", "7", home=tmp_path)
+    assert "no point 7" in str(result.exception)
+
+
 def test_too_short_a_curve_calibrates_nothing() -> None:
     depth = np.linspace(0, 1, 5)
     with pytest.raises(DesignError, match="measure deeper"):
