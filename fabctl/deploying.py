@@ -22,6 +22,7 @@ from design.deploy.levels import Layout, prolong, refine, sheet_layout
 from design.deploy.shell import Reals
 from design.findings import Finding
 from design.meshfiles import read_mesh
+from design.preview import few_ticks
 from design.surface import TriMesh
 from fabctl.config.material import load_material
 from fabctl.config.spec import load_spec
@@ -182,5 +183,6 @@ def _stage(mesh: TriMesh, title: str):  # type: ignore[no-untyped-def]  # matplo
     for k, name in enumerate("xyz"):
         getattr(axes, f"set_{name}lim")(middle[k] - reach, middle[k] + reach)
         getattr(axes, f"set_{name}label")(f"{name}, mm")
+    few_ticks(axes)
     axes.set_title(title)
     return figure, axes, faces

@@ -127,7 +127,7 @@ def run_test(
     with contextlib.closing(open_indenter(bench.url("rig"), plan.registers)) as rig:
         identity = rig.identify()
         _refuse_rig(plan, identity)
-        config = _config(plan, identity, {**rig.environment(), **(facts or {})})
+        config = _config(plan, identity, {**rig.environment(), **(facts or {})}, bench.config.is_simulated)
         inputs = [plan.method_path, plan.map_path]
         inputs += [p for p in (plan.specimen.design / "response.csv",) if p.is_file()]
         run = start_run(lab.runs, "indent", specimen=plan.specimen.name, inputs=inputs, config=config)
@@ -254,7 +254,7 @@ def _refuse_rig(plan: IndentPlan, identity: Identity) -> None:
         raise RefusedError(f"{identity.model} cannot run method {plan.method.name}", found)
 
 
-def _config(plan: IndentPlan, identity: Identity, facts: Mapping[str, Any]) -> dict[str, Any]:
+def _config(plan: IndentPlan, identity: Identity, facts: Mapping[str, Any], simulated: bool) -> dict[str, Any]:
     """Return what is frozen into the run: method, plan, rig, calibration, and the conditions."""
     record = plan.specimen.record()
     known = {key: record[key] for key in ("thickness_mm", "batch", "rest_h", "deployed_utc") if key in record}
@@ -262,6 +262,7 @@ def _config(plan: IndentPlan, identity: Identity, facts: Mapping[str, Any]) -> d
         "method": plan.method.model_dump(mode="json"),
         "plan": [asdict(action) for action in plan.actions],
         "rig": {**asdict(identity), "map": plan.registers.name, "indenter_radius_mm": plan.rig.indenter_radius_mm},
+        "simulated": simulated,
         "sample_hz": plan.sample_hz,
         "calibration": plan.calibration.as_dict() if plan.calibration is not None else None,
         "conditions": {**known, **facts},
