@@ -11,7 +11,7 @@ GOOD = Figure("kept", 1, "", "", True, 1)
 
 
 def refuse(_: int) -> list[Figure]:
-    raise RefusedError("3 of 4 marks")
+    raise RefusedError("3 of 4 marks", [])
 
 
 def test_a_part_that_is_refused_is_missed_and_the_others_are_kept(
