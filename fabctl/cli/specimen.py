@@ -11,6 +11,10 @@ import click
 from fabctl.cli.common import json_option, lab, show
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from design.findings import Finding
     from fabctl.workspace import Specimen
 
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
@@ -83,12 +87,25 @@ def _fact(text: str) -> tuple[str, Any]:
     return key, value if isinstance(number, float) and number - number != 0 else number
 
 
+def _why_no_id(image: NDArray[np.uint8], path: Path) -> Finding:
+    """Return why the picture shows no id: a mirrored one, or none at all."""
+    from design.findings import Finding
+    from fabctl.vision.ids import read_ids
+
+    turned = read_ids(image[:, ::-1].copy())
+    if turned:
+        text = f"{turned[0].specimen} is seen in a mirror: the picture, or the specimen, is the other way round"
+        return Finding("ID-MIRRORED", text, where=str(path), hint="photograph the engraved side, without mirroring")
+    hint = "nearer (3 px a module at least), sharper, less tilted, no glare"
+    return Finding("ID-NONE", "no specimen id in the picture", where=str(path), hint=hint)
+
+
 @command.command("read")
 @click.argument("image", type=FILE)
 @json_option
 def read(image: Path, as_json: bool) -> None:
     """Read the engraved ids in a picture, and say which runs they have."""
-    from design.findings import Finding, errors
+    from design.findings import errors
     from fabctl.cli.camera import picture_file
     from fabctl.errors import RefusedError
     from fabctl.vision.ids import read_ids
@@ -98,11 +115,8 @@ def read(image: Path, as_json: bool) -> None:
     found = picture_findings(frame.image, frame.source)
     ids = [] if errors(found) else read_ids(frame.image)
     if not ids:
-        hint = "nearer (3 px a module at least), sharper, less tilted, no glare"
-        none = (
-            [] if errors(found) else [Finding("ID-NONE", "no specimen id in the picture", where=str(image), hint=hint)]
-        )
-        raise RefusedError(f"{image}: nothing to read", [*found, *none])
+        reasons = found if errors(found) else [*found, _why_no_id(frame.image, image)]
+        raise RefusedError(f"{image}: nothing to read", reasons)
     place = lab()
     rows = []
     for engraved in ids:
