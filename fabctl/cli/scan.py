@@ -32,6 +32,11 @@ def command() -> None:
 @click.argument("words", nargs=-1, metavar="[SPECIMEN] [CLOUD]")
 @click.option("--target", type=FILE, help="Target mesh, for a cloud without a specimen.")
 @click.option(
+    "--predicted",
+    type=FILE,
+    help="Deployed shape that a model foresaw, compared as well  [the specimen's deployed.ply].",
+)
+@click.option(
     "--scale",
     type=click.Choice(["free", "known", "markers"]),
     default="free",
@@ -68,6 +73,7 @@ def command() -> None:
 def run_scan(
     words: tuple[str, ...],
     target: Path | None,
+    predicted: Path | None,
     scale: str,
     unit_mm: float,
     markers: Path | None,
@@ -98,7 +104,8 @@ def run_scan(
         raise UsageError("name a specimen, or give --target")
     if scale != "markers" and (bars or model):
         raise UsageError("--bars and --model belong to --scale markers")
-    predicted = None if specimen is None else specimen.design / "deployed.ply"
+    if predicted is None and specimen is not None and (specimen.design / "deployed.ply").is_file():
+        predicted = specimen.design / "deployed.ply"
     options: dict[str, Any] = {
         "scale": scale,
         "unit_mm": unit_mm,
@@ -116,7 +123,7 @@ def run_scan(
         "seed": seed,
     }
     if cloud is not None:
-        request = Request(cloud, mesh, predicted if predicted and predicted.is_file() else None, **options)
+        request = Request(cloud, mesh, predicted, **options)
         return _run(here, request, specimen, as_json)
     if specimen is None:
         raise UsageError("give the cloud's file")

@@ -43,6 +43,7 @@ DENSE_POINTS = 60_000
 JUDGE_POINTS = 4000
 CANDIDATES = 6
 LEAST_MEMBERS = 200
+LIKE_SIZE_RATIO = 0.5  # of the specimen's cells; a cluster that large may be another specimen
 MIRROR_BETTER_RATIO = 0.7
 MIRROR_DOUBT_FRAC = 0.005
 SAME_POSE_FRAC = 0.004
@@ -289,7 +290,7 @@ def _finished(
             specimen = specimen_points(task, body.part, best.pose)
             if NO_SYMMETRIES.apart_frac(before, best.pose, task.target) < SETTLED_FRAC:
                 break
-    findings = tuple(_findings(task, status, best, alternatives))
+    findings = tuple(_findings(task, status, best, alternatives, body.part))
     return Registration(status, best, alternatives, body.part, specimen, task.symmetries, findings, decided_by)
 
 
@@ -331,7 +332,25 @@ def _too_low(found: Closest, pose: Similarity, cleaned: Cleaned, room_cu: float 
     return np.asarray(height < cleaned.table_top_cu * (1 + 0.9 * level) + room_cu)
 
 
-def _findings(task: Task, status: Status, best: Judged, alternatives: tuple[Judged, ...]) -> Iterator[Finding]:
+def _left_aside(cleaned: Cleaned, part: Part) -> Iterator[Finding]:
+    """Yield a warning where the scan holds another thing about as large as the one compared."""
+    sizes = np.bincount(cleaned.cluster[cleaned.cluster >= 0])
+    taken = np.bincount(cleaned.cluster[(cleaned.cluster >= 0) & part.cells], minlength=len(sizes))
+    if len(sizes) == 0 or "plane kept" in part.name:
+        return
+    others = np.flatnonzero((taken == 0) & (sizes > LIKE_SIZE_RATIO * taken.max()))
+    if len(others):
+        yield Finding(
+            "SCAN-OTHERS",
+            f"{len(others)} more thing(s) of about the specimen's size lie in the scan and were not compared",
+            level="warning",
+            hint="if there are several specimens, cut the cloud apart and compare each",
+        )
+
+
+def _findings(
+    task: Task, status: Status, best: Judged, alternatives: tuple[Judged, ...], part: Part
+) -> Iterator[Finding]:
     cleaned, symmetries, target = task.cleaned, task.symmetries, task.target
     if status == "failed":
         yield Finding(
@@ -362,6 +381,8 @@ def _findings(task: Task, status: Status, best: Judged, alternatives: tuple[Judg
                 level="warning",
                 hint="datum points (--datum) decide; the numbers hold for every such pose listed",
             )
+    if status in ("aligned", "symmetric"):
+        yield from _left_aside(cleaned, part)
     if status in ("aligned", "symmetric", "ambiguous") and cleaned.table is not None:
         up = best.pose.rotation @ cleaned.table.normal
         area = target.mesh.face_areas_mm2()
