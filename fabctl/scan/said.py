@@ -18,7 +18,7 @@ LIKE_SIZE_RATIO = 0.5  # of the specimen's cells; a cluster that large may be an
 Status = Literal["aligned", "symmetric", "ambiguous", "failed", "mirrored"]
 
 
-def _left_aside(cleaned: Cleaned, part: Part) -> Iterator[Finding]:
+def left_aside(cleaned: Cleaned, part: Part) -> Iterator[Finding]:
     """Yield a warning where the scan holds another thing about as large as the one compared."""
     sizes = np.bincount(cleaned.cluster[cleaned.cluster >= 0])
     taken = np.bincount(cleaned.cluster[(cleaned.cluster >= 0) & part.cells], minlength=len(sizes))
@@ -74,7 +74,7 @@ def findings_of(
                 hint="datum points (--datum) decide; the numbers hold for every such pose listed",
             )
     if status in ("aligned", "symmetric"):
-        yield from _left_aside(cleaned, part)
+        yield from left_aside(cleaned, part)
     if status in ("aligned", "symmetric", "ambiguous") and cleaned.table is not None:
         up = best.pose.rotation @ cleaned.table.normal
         area = target.mesh.face_areas_mm2()
