@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.findings import Finding
-from fabctl.errors import RefusedError
+from fabctl.errors import RefusedError, UnreadableInput
 from fabctl.scan.columns import HEAD_BYTES, Columns, comma_is_decimal, named_columns, said_columns
 
 Floats = NDArray[np.float64]
@@ -182,7 +182,7 @@ def _ply_piece(column: dict[str, NDArray[np.generic]], header: PlyHeader) -> Pie
 
 def _cut_short(path: Path, count: int, left: int) -> RefusedError:
     said = f"the file ends after {count - left} of {count} points"
-    return RefusedError(f"{path}: cannot be compared", [Finding("SCAN-CUT", said, where=str(path))])
+    return UnreadableInput(f"{path}: cannot be compared", [Finding("SCAN-CUT", said, where=str(path))])
 
 
 # --- text ------------------------------------------------------------------------------------------------------------
@@ -319,6 +319,5 @@ def las_pieces(path: Path) -> Iterator[Piece]:
                     colours = colours * gain
                 yield Piece(points.astype(np.float64), _extra(None, colours, len(points)))
     except (laspy.errors.LaspyException, OSError, ValueError) as fault:
-        raise RefusedError(
-            f"{path}: cannot be compared", [Finding("SCAN-LAS", f"not a LAS file: {fault}", where=str(path))]
-        ) from fault
+        said = Finding("SCAN-LAS", "not a LAS file, or damaged", where=str(path))
+        raise UnreadableInput(f"{path}: cannot be compared", [said]) from fault
