@@ -9,8 +9,8 @@ import os
 import sys
 from pathlib import Path
 
+from drivers.clock import WallClock
 from drivers.rig.indenter import open_indenter
-from fabctl.clock import WallClock
 from fabctl.config.method import Approach, LimitsConfig, Load, MethodConfig, Tare
 from fabctl.config.rig import load_rig
 from fabctl.events import Event

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.clock import WallClock
 from drivers.rig.indenter import open_indenter
-from fabctl.clock import WallClock
 from fabctl.config.method import Hold, LimitsConfig, MethodConfig
 from fabctl.config.rig import load_rig
 from fabctl.indent.method import Action

@@ -14,7 +14,7 @@ import math
 import os
 import secrets
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -22,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
+from design.coupon import CELLS, Coupon, coupon_facts, coupon_texts
 from design.deploy.indentation import response_csv
-from design.errors import BundleError
+from design.errors import BundleError, NoBundle
 from design.export.dxf import dxf
 from design.export.svg import svg
 from design.findings import Finding
@@ -31,15 +32,16 @@ from design.job import Job
 from design.meshfiles import write_ply
 from design.pattern.drawing import Drawing, as_json, from_json
 from design.pipeline import Design
-from design.preview import preview_png
+from design.preview import coupon_png, preview_png
 from design.surface import TriMesh
 
 FORMAT = 1
 ALWAYS = ("spec.yaml", "target.ply", "flat.ply", "cells.csv", "paths.json", "cut.dxf", "cut.svg", "cut.nc")
-ALSO = ("findings.json", "preview.png")
+COUPON = ("coupon.yaml", "cells.csv", "paths.json", "cut.dxf", "cut.svg", "cut.nc", "preview.png")
+NEEDED = {"design": ALWAYS, "coupon": COUPON}  # by the manifest's kind
+TO_FILL_IN = ("coupon.csv",)  # written on after the build, so its hash is not kept
 PREDICTED = ("deployed.ply", "response.csv")
 LIBRARIES = ("fabctl", "numpy", "scipy", "shapely", "ezdxf")
-COLUMNS = ("cell", "cx_mm", "cy_mm", "inverted", "t_mm", "theta_deg", "expansion_ratio", "hinge_mm", "kind")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +51,15 @@ class Bundle:
     path: Path
     manifest: Mapping[str, Any]
 
+    @property
+    def kind(self) -> str:
+        """Return "design", or "coupon" for a sheet of patches that has no target."""
+        return str(self.manifest.get("kind", "design"))
+
     def file(self, name: str) -> Path:
         """Return one of the folder's files; raise `BundleError` where this design has none of that name."""
         if name not in self.manifest["files"]:
-            raise BundleError(f"{self.path}: this design has no {name}")
+            raise BundleError(f"{self.path}: this {self.kind} has no {name}")
         return self.path / name
 
     def drawing(self, sheet: int | None = None) -> Drawing:
@@ -68,21 +75,34 @@ class Bundle:
 
 def open_bundle(path: Path) -> Bundle:
     """Return the design in a folder; raise `BundleError` with everything that is missing, edited or of another age."""
-    try:
-        manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
-        files = dict(manifest["files"])
-    except FileNotFoundError:
-        raise BundleError(f"{path}: no design here (manifest.json is missing)") from None
-    except (OSError, ValueError, KeyError, TypeError) as fault:
-        raise BundleError(f"{path}: manifest.json cannot be read: {fault}") from fault
+    manifest = _manifest(path)
+    files: dict[str, Any] = manifest["files"]
     if manifest.get("format") != FORMAT:
         raise BundleError(f"{path}: a design of format {manifest.get('format')!r}; this program reads {FORMAT}")
+    kind = str(manifest.get("kind", "design"))
+    if kind not in NEEDED:
+        raise BundleError(f"{path}: a folder of kind {kind!r}; this program reads {', '.join(NEEDED)}")
     found = [_fault(path / name, name, str(digest)) for name, digest in sorted(files.items())]
-    found += [Finding("BUNDLE-MISSING", "is not in the manifest", where=name) for name in ALWAYS if name not in files]
+    missing = [name for name in NEEDED[kind] if name not in files]
+    found += [Finding("BUNDLE-MISSING", "is not in the manifest", where=name) for name in missing]
     faults = [finding for finding in found if finding is not None]
     if faults:
         raise BundleError(f"{path}: not as it was built; build it again", faults)
     return Bundle(path, manifest)
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise NoBundle(f"{path}: no design here (manifest.json is missing)") from None
+    except OSError as fault:
+        raise NoBundle(f"{path}: manifest.json cannot be read: {(fault.strerror or 'unknown').lower()}") from fault
+    except (ValueError, RecursionError) as fault:
+        raise NoBundle(f"{path}: manifest.json is not JSON; build the design again") from fault
+    if not isinstance(found, dict) or not isinstance(found.get("files"), dict):
+        raise NoBundle(f"{path}: manifest.json is not that of a design; build the design again")
+    return found
 
 
 def _fault(path: Path, name: str, digest: str) -> Finding | None:
@@ -100,14 +120,33 @@ def write_bundle(design: Design, spec_text: str, path: Path, replace: bool = Fal
 
     An existing folder is refused, unless it is empty, or `replace` is true and it holds a design.
     """
-    if path.exists() and not _may_replace(path, replace):
-        raise BundleError(f"{path}: exists already; choose another folder, or say that a design there may be replaced")
+    about = {"name": design.spec.name, "library": design.library_hash, "facts": facts(design)}
+    return _write_whole(path, replace, about, lambda draft: _write_files(design, spec_text, draft))
+
+
+def write_coupon_bundle(
+    made: Coupon, job: Job, spec_text: str, library_hash: str, edge_mm: float, path: Path
+) -> Bundle:
+    """Write a coupon's folder, which is cut as a design's is, and return it."""
+    about = {"name": "coupon", "kind": "coupon", "library": library_hash, "facts": coupon_facts(made, job, edge_mm)}
+
+    def fill(folder: Path) -> None:
+        texts = {**coupon_texts(made, job), "coupon.yaml": spec_text, "paths.json": _paths_text(made.drawing)}
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        (folder / "preview.png").write_bytes(coupon_png(made))
+
+    return _write_whole(path, False, about, fill)
+
+
+def _write_whole(path: Path, replace: bool, about: Mapping[str, Any], fill: Callable[[Path], None]) -> Bundle:
+    refuse_taken(path, replace)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     draft.mkdir()
     try:
-        _write_files(design, spec_text, draft)
-        _write_manifest(design, draft)
+        fill(draft)
+        _write_manifest(draft, about)
         if path.exists():
             shutil.rmtree(path)
         draft.rename(path)
@@ -115,6 +154,12 @@ def write_bundle(design: Design, spec_text: str, path: Path, replace: bool = Fal
         shutil.rmtree(draft, ignore_errors=True)
         raise
     return open_bundle(path)
+
+
+def refuse_taken(path: Path, replace: bool = False) -> None:
+    """Raise `BundleError` where no design may be written into the folder; for asking before a long build."""
+    if path.exists() and not _may_replace(path, replace):
+        raise BundleError(f"{path}: exists already; choose another folder, or say that a design there may be replaced")
 
 
 def _may_replace(path: Path, replace: bool) -> bool:
@@ -146,11 +191,15 @@ def _write_files(design: Design, spec_text: str, folder: Path) -> None:
 
 def _cut_texts(suffix: str, drawing: Drawing, job: Job, title: str) -> dict[str, str]:
     return {
-        f"paths{suffix}.json": json.dumps(as_json(drawing), allow_nan=False) + "\n",
+        f"paths{suffix}.json": _paths_text(drawing),
         f"cut{suffix}.dxf": dxf(drawing.paths, drawing.size_mm),
         f"cut{suffix}.svg": svg(drawing.paths, drawing.size_mm, title),
         f"cut{suffix}.nc": "\n".join(job.lines) + "\n",
     }
+
+
+def _paths_text(drawing: Drawing) -> str:
+    return json.dumps(as_json(drawing), allow_nan=False) + "\n"
 
 
 def cells_csv(design: Design) -> str:
@@ -158,7 +207,7 @@ def cells_csv(design: Design) -> str:
     cells = design.cells
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(COLUMNS)
+    rows.writerow(CELLS)
     for k, (x, y) in enumerate(cells.tiling.centres_mm().tolist()):
         numbers = (
             cells.choice.t_mm[k],
@@ -171,19 +220,14 @@ def cells_csv(design: Design) -> str:
     return text.getvalue()
 
 
-def _write_manifest(design: Design, folder: Path) -> None:
+def _write_manifest(folder: Path, about: Mapping[str, Any]) -> None:
     files = {}
     for path in sorted(folder.iterdir()):
-        files[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        if path.name not in TO_FILL_IN:
+            files[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
         _sync(path)
-    body = {
-        "format": FORMAT,
-        "name": design.spec.name,
-        "files": files,
-        "library": design.library_hash,
-        "versions": {name: _version(name) for name in LIBRARIES},
-        "facts": facts(design),
-    }
+    versions = {name: _version(name) for name in LIBRARIES}
+    body = {"format": FORMAT, **about, "files": files, "versions": versions}
     path = folder / "manifest.json"
     path.write_text(json.dumps(body, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
     _sync(path)
@@ -206,11 +250,16 @@ def facts(design: Design) -> dict[str, Any]:
     if design.sheets:
         found["sheets_mm"] = [list(one.drawing.size_mm) for one in design.sheets]
     if design.predicted is not None:
-        deviation = design.predicted.deployed.deviation
+        deviation, rest = design.predicted.deployed.deviation, design.predicted.deployed.equilibrium
         found |= {
             "deviation_mean_mm": deviation.mean_mm,
             "deviation_max_mm": deviation.max_mm,
             "deviation_mean_frac": deviation.mean_frac,
+            "residual_ratio": rest.residual_ratio,
+            "iterations_count": rest.iterations_count,
+            "smallest_eigenvalue_N_mm": design.predicted.smallest_eigenvalue_N_mm,
+            "response_residual_ratio": design.predicted.response.residual_ratio,
+            "response_unstable_count": design.predicted.response.unstable_count,
             "stiffness_2mm_N_mm": design.predicted.response.stiffness_N_mm(2.0),
         }
     return found

@@ -61,7 +61,8 @@ def compose_job(
     if id_text:
         if drawing.id_anchor is None:
             raise DesignError(f"the drawing keeps no place for an id, so {id_text!r} cannot be engraved")
-        paths += text_strokes(id_text, drawing.id_anchor)
+        for anchor in (drawing.id_anchor, *drawing.more_ids):
+            paths += text_strokes(id_text, anchor)
     paths += code
     if not paths:
         raise DesignError("nothing is drawn, so there is nothing to cut")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,24 @@ def read_corner_uv(path: Path | str) -> tuple[Points, Points]:
     return soup.points[faces], soup.texture[texture_faces]
 
 
+def read_given_flat(path: Path | str, mesh: TriMesh) -> Points:
+    """Return the flat that an OBJ gives for `mesh`, which was read from it, by face corners `(m, 3, 2)`.
+
+    Raises `MeshError` where the file's faces are not those of the mesh: some were left out or divided.
+    """
+    try:
+        corners_mm, flat_mm = read_corner_uv(path)
+    except (ValueError, IndexError):  # polygons of several sizes, or corners without texture
+        corners_mm = flat_mm = np.zeros((0, 3, 3))
+    if corners_mm.shape[1:] != (3, 3) or len(corners_mm) != len(mesh.faces):
+        told = Finding("FILE-TEXTURE", "its texture coordinates are not one for every corner of its triangles")
+        raise MeshError(f"{path}: gives no flat of this surface", [told])
+    if np.abs(mesh.vertices_mm[mesh.faces] - corners_mm).max() > WELD_ratio * mesh.diagonal_mm():
+        told = Finding("FILE-TEXTURE", "its faces were put in another order when it was read")
+        raise MeshError(f"{path}: gives no flat of this surface", [told])
+    return flat_mm
+
+
 def _read_soup(path: Path) -> Soup:
     parse = _PARSERS.get(path.suffix.lower())
     try:
@@ -73,7 +92,7 @@ def _read_soup(path: Path) -> Soup:
 
 def _or_raise(path: Path, found: list[Finding]) -> list[Finding]:
     """Return the findings where none forbids going on."""
-    found = [Finding(f.code, f.message, f.level, f.where or path.name, f.hint) for f in found]
+    found = [replace(f, where=f.where or path.name) for f in found]
     wrong = errors(found)
     if not wrong:
         return found

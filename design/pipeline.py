@@ -15,6 +15,7 @@ from design.cells.monostable import monostable_cells
 from design.cells.select import Choice, SelectionCurve, on_curve, select, selection_curve
 from design.cells.sheet import Sheet
 from design.compensated import compensated
+from design.deploy.supports import Support
 from design.errors import OutOfLibrary
 from design.findings import Finding
 from design.flatten import Flattening, Limits, feasibility, flatten
@@ -116,7 +117,8 @@ def build(
     flat, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)
     if spec.compensate:
         cut = np.array([kind == "cut" for kind in kinds_of(spec, tiling)])
-        wanted, choice = compensated(flat, tiling, wanted, choice, cut, library, curve, wide, found, watch)
+        rim: Support = "free" if spec.compensate is True else spec.compensate
+        wanted, choice = compensated(flat, tiling, wanted, choice, cut, library, curve, wide, found, watch, rim)
     hinge = hinges_mm(spec, choice, library)
     if curve is None and np.abs(hinge - base.sheet.hinge_mm).max() > HINGE_SAME_MM:
         choice, changed = as_cut(base, choice, hinge)
@@ -187,10 +189,10 @@ def lay_flat(spec: DesignSpec, mesh: TriMesh, curve: SelectionCurve | None, foun
     """Return the flat of `mesh`, by the first rung of the ladder on which the library's range is enough.
 
     Raises `OutOfLibrary` with what the ladder found where it ends before that. Cones that the specification asks for
-    are placed without climbing.
+    are placed without climbing, and a flat that is given is taken as it is.
     """
     remedy = {"report": "none"}.get(spec.infeasible, spec.infeasible)
-    if curve is None or spec.flatten.cones_count:
+    if curve is None or spec.flatten.cones_count or spec.flatten.given_mm is not None:
         flat = flatten(mesh, spec.flatten)
         found += flat.findings
         return flat

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from design.coupon import Coupon
 from design.export.svg import COLOURS
+from design.pattern.drawing import Drawing
 from design.pattern.paths import LAYERS, CutPath
 from design.pattern.tiling import Array
 from design.pipeline import Design
@@ -27,29 +29,54 @@ def preview_png(design: Design) -> bytes:
     FigureCanvasAgg(figure)
     if predicted:
         grid = figure.add_gridspec(2, 2, width_ratios=[2, 1])
-        _draw_sheet(figure, figure.add_subplot(grid[:, 0]), design)
+        _draw_design(figure, figure.add_subplot(grid[:, 0]), design)
         _draw_deployed(figure.add_subplot(grid[0, 1], projection="3d"), design)
         _draw_response(figure.add_subplot(grid[1, 1]), design)
     else:
-        _draw_sheet(figure, figure.add_subplot(), design)
+        _draw_design(figure, figure.add_subplot(), design)
+    return _png(figure)
+
+
+def coupon_png(made: Coupon) -> bytes:
+    """Return a PNG of a coupon's sheet; patches that spring back are drawn as expanding by nothing."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    width, height = made.drawing.size_mm
+    figure = Figure(figsize=(WIDTH_INCHES, WIDTH_INCHES * height / width), layout="constrained")
+    FigureCanvasAgg(figure)
+    corners = np.concatenate([tiling.vertices_mm[tiling.cells] for tiling in made.tilings])
+    counts = [len(tiling.cells) for tiling in made.tilings]
+    expansion = np.repeat([patch.expansion_ratio or 1.0 for patch in made.patches], counts)
+    title = f"coupon: {len(made.patches)} patches on {width:.0f} × {height:.0f} mm"
+    _draw_sheet(figure, figure.add_subplot(), made.drawing, corners, expansion, title)
+    return _png(figure)
+
+
+def _png(figure: Any) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
     return file.getvalue()
 
 
-def _draw_sheet(figure: Any, axes: Any, design: Design) -> None:
+def _draw_design(figure: Any, axes: Any, design: Design) -> None:
+    cells, (width, height) = design.cells, design.drawing.size_mm
+    corners = cells.tiling.vertices_mm[cells.tiling.cells]
+    title = f"{design.spec.name}: {len(corners)} cells on {width:.0f} × {height:.0f} mm"
+    _draw_sheet(figure, axes, design.drawing, corners, cells.choice.expansion_ratio, title)
+
+
+def _draw_sheet(figure: Any, axes: Any, drawing: Drawing, corners_mm: Array, expansion: Array, title: str) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
-    cells, drawing = design.cells, design.drawing
-    corners = cells.tiling.vertices_mm[cells.tiling.cells]
-    faces = PolyCollection(list(corners), array=cells.choice.expansion_ratio, cmap="viridis", alpha=0.45, linewidths=0)
+    faces = PolyCollection(list(corners_mm), array=expansion, cmap="viridis", alpha=0.45, linewidths=0)
     axes.add_collection(faces)
     for layer in LAYERS:
         lines = [_closed(path) for path in drawing.paths if path.layer == layer]
         axes.add_collection(LineCollection(lines, colors=COLOURS[layer], linewidths=0.9 if layer == "outline" else 0.6))
     width, height = drawing.size_mm
     axes.set(xlim=(0, width), ylim=(0, height), xlabel="x, mm", ylabel="y, mm", aspect="equal")
-    axes.set_title(f"{design.spec.name}: {len(corners)} cells on {width:.0f} × {height:.0f} mm")
+    axes.set_title(title)
     figure.colorbar(faces, ax=axes, label="expansion, deployed over flat length", shrink=0.6)
 
 

@@ -1,4 +1,4 @@
-"""The time a driver lives in; passed in, so that tests can turn it."""
+"""Time as a thing that is passed in, so that tests can turn it."""
 
 from __future__ import annotations
 

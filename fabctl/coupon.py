@@ -5,22 +5,22 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean, stdev
+from typing import Any
 
+from design.bundle import open_bundle
+from design.coupon import FORM
 from design.findings import Finding
-from fabctl.errors import RefusedError
+from fabctl.errors import RefusedError, UnreadableInput
+from fabctl.files import text_of
+from fabctl.records.folder import RunFolder, start_run
+from fabctl.workspace import Workspace
 
-COLUMNS = (
-    "patch",
-    "hinge_mm",
-    "expected_expansion_ratio",
-    "flat_length_mm",
-    "measured_length_mm",
-    "cycles_count",
-    "failed_at",
-)
+FORM_ROUNDING = 6e-5  # the form is printed with four decimals
 COVERAGE = 2.0  # the uncertainty given is about 95 %
 LOW_RATIO, HIGH_RATIO = 0.9, 2.2  # a length outside that is a slip of the pen: no cell expands so
 
@@ -54,16 +54,13 @@ def read_form(path: Path, length_error_mm: float) -> list[Measured]:
     Several readings of one length stand in its field parted by spaces or semicolons. `length_error_mm` is the standard
     error of one reading of the rule or calliper; it counts once for a patch, the scatter of readings beside it.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as fault:
-        raise RefusedError("the form cannot be read", [Finding("COUPON-FORM", str(fault), where=str(path))]) from fault
+    text = text_of(path, "a coupon's form")
     rows = list(csv.DictReader(text.splitlines()))
     names = rows[0].keys() if rows else ()
-    missing = [name for name in COLUMNS if name not in names]
+    missing = [name for name in FORM if name not in names]
     if missing:
         text = f"has no column {', '.join(missing)}" if rows else "has no rows"
-        raise RefusedError("not a coupon's form", [Finding("COUPON-FORM", text, where=str(path))])
+        raise UnreadableInput("not a coupon's form", [Finding("COUPON-FORM", text, where=str(path))])
     found: list[Finding] = []
     patches = [_patch(row, f"{path}:{line}", length_error_mm, found) for line, row in enumerate(rows, start=2)]
     names_seen = [row["patch"] for row in rows]
@@ -122,12 +119,52 @@ def _count(name: str, text: str, where: str, found: list[Finding], needed: bool)
     return None
 
 
+def as_rows(patches: list[Measured]) -> list[dict[str, Any]]:
+    """Return the patches as plain JSON."""
+    return [asdict(patch) | {"off_ratio": patch.off_ratio(), "agrees": patch.agrees()} for patch in patches]
+
+
 def write_measured(form: Path, patches: list[Measured], length_error_mm: float) -> Path:
     """Write `measured.json` beside the form and return where; an earlier one is replaced."""
-    rows = [asdict(patch) | {"off_ratio": patch.off_ratio(), "agrees": patch.agrees()} for patch in patches]
     path = form.with_name("measured.json")
-    body = {"format": 1, "form": form.name, "length_error_mm": length_error_mm, "patches": rows}
+    body = {"format": 1, "form": form.name, "length_error_mm": length_error_mm, "patches": as_rows(patches)}
     draft = path.with_suffix(".tmp")
     draft.write_text(json.dumps(body, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     draft.replace(path)
     return path
+
+
+def keep_result(
+    lab: Workspace, specimen: str, form: Path, patches: list[Measured], length_error_mm: float
+) -> RunFolder:
+    """Write a run of kind `coupon` with the form and what it says; raise `RefusedError` where it is another's form."""
+    design = open_bundle(lab.specimen(specimen).design)
+    if design.kind != "coupon":
+        told = Finding("COUPON-SPECIMEN", "was cut from a design, not from a coupon", where=specimen)
+        raise RefusedError("the form cannot be this specimen's", [told])
+    cut = {row["patch"]: row for row in design.manifest["facts"]["patches"]}
+    found = [text for patch in patches if (text := _unlike(patch, cut.get(patch.patch)))]
+    if found:
+        raise RefusedError(
+            f"the form is not that of {specimen}", [Finding("COUPON-OTHER", text, where=str(form)) for text in found]
+        )
+    run = start_run(lab.runs, "coupon", specimen=specimen, inputs=[form], config={"length_error_mm": length_error_mm})
+    shutil.copyfile(form, run.artefact("coupon.csv"))
+    missing = sorted(cut.keys() - {patch.patch for patch in patches})
+    run.write_result({"patches": as_rows(patches), "missing": missing})
+    run.finish("done", f"{len(patches)} patches read")
+    return run
+
+
+def _unlike(patch: Measured, cut: Mapping[str, Any] | None) -> str:
+    """Return what a form's patch has that the coupon as cut has not; nothing where they are the same."""
+    if cut is None:
+        return f"patch {patch.patch} was not cut"
+    if abs(patch.hinge_mm - cut["hinge_mm"]) > FORM_ROUNDING:
+        return f"patch {patch.patch}: its hinge is {patch.hinge_mm:g} mm, cut with {cut['hinge_mm']:g} mm"
+    expected = cut["expected_expansion_ratio"]
+    if (expected is None) != (patch.expected_ratio is None) or (
+        expected is not None and abs((patch.expected_ratio or 0.0) - expected) > FORM_ROUNDING
+    ):
+        return f"patch {patch.patch}: expected to expand by {patch.expected_ratio}, the coupon says {expected}"
+    return ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +18,14 @@ from design.cells.library import CellLibrary, hexagon_mm2
 from design.cells.sheet import Sheet
 from design.deploy.cascade import Wells
 from design.deploy.designed import lift
-from design.deploy.levels import Layout, sheet_layout
+from design.deploy.levels import Layout, prolong, refine, sheet_layout
 from design.deploy.shell import Reals
 from design.findings import Finding
 from design.meshfiles import read_mesh
 from design.surface import TriMesh
 from fabctl.config.material import load_material
 from fabctl.config.spec import load_spec
-from fabctl.designing import library_of, sheet_of
+from fabctl.designing import library_file, library_of, sheet_of
 from fabctl.errors import RefusedError
 
 NUMBERS = ("cx_mm", "cy_mm", "inverted", "t_mm", "theta_deg", "expansion_ratio", "hinge_mm")
@@ -62,7 +62,7 @@ def read_laid(folder: Path, home: Path) -> Laid:
     flat = _flat_vertices(centre, inverted, edge_mm, shape)
     config, _ = load_spec(str(bundle.file("spec.yaml")), home)
     sheet = sheet_of(load_material(config.material, home), edge_mm)
-    library = library_of(config).scaled(sheet)
+    library = library_of(config, library_file(config, folder)).scaled(sheet)
     if config.cells == "expanding":
         library = with_hinge(library, float(np.median(table["hinge_mm"])))
     cells = library.at(t, theta)
@@ -83,6 +83,16 @@ def read_laid(folder: Path, home: Path) -> Laid:
         goal = lift(flat, paper.vertices_mm[:, :2], paper.faces, target.vertices_mm, target.faces)
     layout = sheet_layout(flat, shape.faces, expansion, Y, nu, D)
     return Laid(layout, shape.vertices_mm, target, goal, sheet, t, theta, library)
+
+
+def divided(laid: Laid, parts: int) -> Laid:
+    """Return the same sheet with `parts`² triangles a unit."""
+    fine = refine(laid.layout, parts)
+    start, design = (
+        None if places is None else prolong(laid.layout, places, fine) for places in (laid.start_mm, laid.design_mm)
+    )
+    assert start is not None
+    return replace(laid, layout=fine, start_mm=start, design_mm=design)
 
 
 def wells_of(laid: Laid) -> Wells:

@@ -159,7 +159,7 @@ def _step(flow: Flow, name: str, words: Sequence[str], run: Run, emit: Emit, hin
         if code == OPERATOR:
             raise StepFailed(name, OPERATOR, "stopped by the operator")
         for finding in found.get("findings", []):  # said in its JSON, which nobody has seen
-            emit(Event("finding", f"{finding['level']} {finding['code']}: {finding['message']}"))
+            emit(Event("finding", f"{finding['level']} {finding['code']}: {finding['what']}"))
         raise StepFailed(name, code if code > 0 else BUG, hint)
     flow.out_of_tolerance |= code == OUT_OF_TOLERANCE
     flow.steps[name] = found

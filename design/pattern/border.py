@@ -56,13 +56,13 @@ def framed(
     """
     anchor, code = None, None
     if options.id_height_mm > 0:
-        piece, anchor, code = _with_tag(piece, mouths_mm, options, edge_mm, joins)
+        piece, anchor, code = with_tag(piece, mouths_mm, options, edge_mm, joins)
     low_x, low_y, high_x, high_y = piece.bounds
     room = options.sheet_margin_mm
     shift = np.array([room - low_x, room - low_y])
     size = (float(high_x - low_x + 2 * room), float(high_y - low_y + 2 * room))
     drawn = [_moved(path, shift) for path in paths]
-    drawn += [CutPath("outline", ring, closed=True) for ring in _rings(translate(piece, *shift))]
+    drawn += border_paths(piece, shift)
     if options.marks:
         drawn += registration_marks(size, options)
     return (
@@ -86,6 +86,11 @@ def piece_of(loops_mm: Sequence[Array], margin_mm: float = 0.0) -> BaseGeometry:
 def rimmed_by(piece: BaseGeometry, margin_mm: float) -> BaseGeometry:
     """Return a piece grown by a rim."""
     return piece.buffer(margin_mm, join_style="mitre", mitre_limit=2.0) if margin_mm > 0 else piece
+
+
+def border_paths(piece: BaseGeometry, shift_mm: Array) -> list[CutPath]:
+    """Return the outlines of a piece that is moved by `shift_mm`."""
+    return [CutPath("outline", ring, closed=True) for ring in _rings(translate(piece, *shift_mm))]
 
 
 def _rings(piece: BaseGeometry) -> list[Array]:
@@ -120,7 +125,7 @@ def registration_marks(size_mm: tuple[float, float], options: BorderOptions) -> 
     return found
 
 
-def _with_tag(
+def with_tag(
     piece: BaseGeometry, mouths_mm: Array, options: BorderOptions, edge_mm: float, joins: BaseGeometry | None
 ) -> tuple[BaseGeometry, Anchor | None, Box | None]:
     """Return the piece with a tag hanging from its lowest edge that has room, and the places on the tag.

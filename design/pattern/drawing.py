@@ -30,13 +30,15 @@ class Box:
 class Drawing:
     """What is to be cut, in sheet millimetres from the sheet's lower left corner, before kerf and ordering.
 
-    `id_anchor` is where the specimen's id is engraved as text, `code_box` the room kept beside it for its code.
+    `id_anchor` is where the specimen's id is engraved as text, `code_box` the room kept beside it for its code;
+    `more_ids` are further places for the text, on a sheet that parts into several pieces.
     """
 
     size_mm: tuple[float, float]
     paths: tuple[CutPath, ...]
     id_anchor: Anchor | None = None
     code_box: Box | None = None
+    more_ids: tuple[Anchor, ...] = ()
 
 
 def as_json(drawing: Drawing) -> dict[str, Any]:
@@ -46,6 +48,7 @@ def as_json(drawing: Drawing) -> dict[str, Any]:
         "sheet_mm": list(drawing.size_mm),
         "id_anchor": asdict(drawing.id_anchor) if drawing.id_anchor else None,
         "code_box": asdict(drawing.code_box) if drawing.code_box else None,
+        **({"more_ids": [asdict(anchor) for anchor in drawing.more_ids]} if drawing.more_ids else {}),
         "paths": [
             {
                 "layer": path.layer,
@@ -67,10 +70,11 @@ def from_json(data: Mapping[str, Any]) -> Drawing:
         width, height = (float(value) for value in data["sheet_mm"])
         anchor = Anchor(**data["id_anchor"]) if data.get("id_anchor") else None
         code = Box(**data["code_box"]) if data.get("code_box") else None
+        more = tuple(Anchor(**item) for item in data.get("more_ids", ()))
         paths = tuple(_path(item) for item in data["paths"])
     except (KeyError, TypeError, ValueError) as fault:
         raise DesignError(f"the paths are not as this program writes them: {fault!r}") from fault
-    return Drawing((width, height), paths, anchor, code)
+    return Drawing((width, height), paths, anchor, code, more)
 
 
 def _path(item: Mapping[str, Any]) -> CutPath:

@@ -7,8 +7,9 @@ from typing import Any, cast
 
 import click
 
-from fabctl.cli.common import json_option, lab, progress, say, show
-from fabctl.cli.finite import numbers
+from fabctl.cli.common import MATERIAL, json_option, lab, progress, say, show
+from fabctl.cli.design_coupon import coupon, coupon_read, library_option
+from fabctl.cli.paths import TARGET, InFile, InFolder, OutFolder, PictureFile, config_names
 from fabctl.events import Event
 
 
@@ -17,11 +18,16 @@ def command() -> None:
     """Turn a target surface into a cut sheet."""
 
 
+command.add_command(coupon)
+command.add_command(coupon_read)
+
+
 @command.command()
-@click.argument("spec")
-@click.option("--target", type=click.Path(path_type=Path), help="Mesh to use instead of the specification's.")
+@click.argument("spec", type=config_names("specs"))
+@click.option("--target", type=InFile(), help="Mesh to use instead of the specification's.")
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell, instead of the specification's.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Design folder to write [out/NAME].")
+@library_option
+@click.option("-o", "--output", type=OutFolder(), help="Design folder to write [out/NAME].")
 @click.option("--replace", is_flag=True, help="Replace a design that lies in that folder.")
 @click.option("--compensate", is_flag=True, help="Change the expansions so that the bent sheet meets the target.")
 @json_option
@@ -29,6 +35,7 @@ def build(
     spec: str,
     target: Path | None,
     cell_mm: float | None,
+    library: Path | None,
     output: Path | None,
     replace: bool,
     compensate: bool,
@@ -41,7 +48,7 @@ def build(
 
     home = lab().root
     folder = output or home / "out" / load_spec(spec, home)[0].name
-    design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress(), compensate)
+    design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress(), compensate, library)
     for finding in design.findings:
         say(str(finding))
     numbers = facts(design)
@@ -62,26 +69,40 @@ def build(
 
 
 @command.command()
-@click.argument("target")
-@click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
+@click.argument("target", type=TARGET)
+@click.option(
+    "--material", type=MATERIAL, help="Material file or its name, for a mesh or surface [natural-rubber-2.3]."
+)
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell [the material's].")
-@click.option("--cells", type=click.Choice(["expanding", "contracting"]), default="expanding", show_default=True,
-              help="Kind of cells, where TARGET is no specification.")  # fmt: skip
+@library_option
+@click.option("--cells", type=click.Choice(["expanding", "contracting"]),
+              help="Kind of cells, for a mesh or surface [expanding].")  # fmt: skip
 @click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]), default="none", show_default=True,
               help="What to try where no single sheet fits.")  # fmt: skip
-@click.option("--picture", type=click.Path(path_type=Path), help="PNG of where the surface does not fit.")
+@click.option("--picture", type=PictureFile((".png",)), help="PNG of where the surface does not fit.")
 @json_option
 def check(
-    target: str, material: str, cell_mm: float | None, cells: str, remedy: str, picture: Path | None, as_json: bool
+    target: str,
+    material: str | None,
+    cell_mm: float | None,
+    library: Path | None,
+    cells: str | None,
+    remedy: str,
+    picture: Path | None,
+    as_json: bool,
 ) -> None:
-    """Say whether a sheet can become TARGET: a mesh file, a specification, or one of the project's own surfaces."""
+    """Say whether a sheet can become TARGET: a specification, a mesh file, or one of the project's own surfaces.
+
+    A name that is a specification and a surface, such as cap, is the specification, as for `fabctl design build`;
+    with --material or --cells it is the surface.
+    """
     from design.checking import check as checked
     from design.checking import misfit_png
     from fabctl.designing import inputs_for
     from fabctl.errors import DONE, REFUSED
 
     listen = progress()
-    inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells))
+    inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
 
     def watch(message: str, done_frac: float) -> None:
         listen(Event("progress", message, done_frac))
@@ -107,13 +128,13 @@ def check(
         lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
-    show({"target": target, "fits": fits, **found.as_dict()}, as_json, lines)
-    raise click.exceptions.Exit(DONE if fits else REFUSED)
+    facts = {"target": target, "fits": fits, **found.as_dict()}
+    show(facts, as_json, lines, DONE if fits else REFUSED, f"{target}: no single sheet fits it as it is")
 
 
 @command.command()
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
+@click.argument("a", type=InFolder())
+@click.argument("b", type=InFolder())
 @json_option
 def compare(a: Path, b: Path, as_json: bool) -> None:
     """Compare two design folders: sheet, cells, cutting, deployed shape and stiffness."""
@@ -126,56 +147,3 @@ def compare(a: Path, b: Path, as_json: bool) -> None:
         lines.append(f"{name:24} {found['a'][name]:14.5g} {found['b'][name]:14.5g} {ratio:10.3f}")
     lines.append(f"{found['cells_at_the_same_place_count']} cells lie at the same place in both")
     show(found, as_json, lines)
-
-
-@command.command()
-@click.option("--expansion", "expansion_ratio", type=float, default=1.5, show_default=True, help="Of the cell to try.")
-@click.option("--hinges-mm", default="0.20,0.25,0.30,0.35,0.40,0.45", show_default=True, help="Ladder of hinge widths.")
-@click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="New folder for the coupon.")
-@json_option
-def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, as_json: bool) -> None:
-    """Make a sheet of uniform patches, one a hinge width, to check the library on the real material."""
-    from fabctl.designing import write_coupon
-
-    hinges = numbers(hinges_mm, "--hinges-mm")
-    patches = write_coupon(output, expansion_ratio, hinges, material, lab().root)
-    lines = [f"{output}: {len(patches)} patches"]
-    for patch in patches:
-        expected = "not bistable" if patch.expansion_ratio is None else f"expands by {patch.expansion_ratio:.4f}"
-        lines.append(f"{patch.label.split()[0]}  hinge {patch.hinge_mm:.3f} mm  {expected}")
-    rows = [{"patch": p.label, "hinge_mm": p.hinge_mm, "expansion_ratio": p.expansion_ratio} for p in patches]
-    show({"folder": str(output), "patches": rows}, as_json, lines)
-
-
-@command.command("coupon-read")
-@click.argument("form", type=click.Path(path_type=Path))
-@click.option("--length-error-mm", type=click.FloatRange(min=0), default=0.2, show_default=True,
-              help="Standard error of one reading of a length.")  # fmt: skip
-@click.option("--specimen", help="Specimen whose record is told where this coupon's result lies.")
-@json_option
-def coupon_read(form: Path, length_error_mm: float, specimen: str | None, as_json: bool) -> None:
-    """Read a coupon's filled FORM (coupon.csv, or its folder): measured expansions against the map."""
-    from dataclasses import asdict
-
-    from fabctl.coupon import read_form, write_measured
-
-    form = form / "coupon.csv" if form.is_dir() else form
-    patches = read_form(form, length_error_mm)
-    written = write_measured(form, patches, length_error_mm)
-    if specimen is not None:
-        lab().specimen(specimen).note(coupon=str(written.resolve()))
-    lines = [f"{'patch':6}{'hinge, mm':>10}{'expected':>10}{'measured':>10}{'± 95 %':>9}{'off':>9}  cycles"]
-    for patch in patches:
-        expected, off = patch.expected_ratio, patch.off_ratio()
-        told = f"{expected:10.4f}" if expected is not None else f"{'none':>10}"
-        away = f"{off:+9.4f}" if off is not None else f"{'':>9}"
-        ended = f", torn at {patch.failed_at_count}" if patch.failed_at_count is not None else ""
-        lines.append(
-            f"{patch.patch:6}{patch.hinge_mm:10.3f}{told}{patch.expansion_ratio:10.4f}{patch.uncertainty_ratio:9.4f}"
-            f"{away}  {patch.cycles_count}{ended}"
-        )
-    outside = [patch.patch for patch in patches if patch.agrees() is False]
-    lines.append(f"outside their uncertainty: {', '.join(outside)}" if outside else "all agree with the map")
-    rows = [asdict(patch) | {"off_ratio": patch.off_ratio(), "agrees": patch.agrees()} for patch in patches]
-    show({"file": str(written), "patches": rows}, as_json, lines)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.paths import RUN, RUN_OR_SPECIMEN, SPECIMEN, OutFile, PictureFile, config_names
 
 if TYPE_CHECKING:
     from fabctl.indent.job import IndentPlan
@@ -32,10 +33,18 @@ def command() -> None:
 
 
 @command.command("run")
-@click.argument("specimen")
-@click.option("--method", default="dome", show_default=True, help="Method file or its name in configs/methods.")
+@click.argument("specimen", type=SPECIMEN)
+@click.option(
+    "--method",
+    type=config_names("methods"),
+    default="dome",
+    show_default=True,
+    help="Method file or its name in configs/methods.",
+)
 @bench_option
-@click.option("--resume", metavar="RUN", help="Go on with an interrupted run, at its next whole curve or point.")
+@click.option(
+    "--resume", type=RUN, metavar="RUN", help="Go on with an interrupted run, at its next whole curve or point."
+)
 @click.option("--temperature-degC", type=float, help="Room temperature, where the rig has no sensor of its own.")
 @click.option("--humidity-frac", type=float, help="Relative humidity, 0 to 1.")
 @click.option("--dry-run", is_flag=True, help="Stop after the check; nothing moves.")
@@ -58,11 +67,10 @@ def run_command(
     from fabctl.config.bench import load_bench
     from fabctl.errors import Stopped
     from fabctl.indent.job import Steering, plan_test, refuse, run_test
-    from fabctl.records.folder import open_run
 
     place = lab()
     bench_config = load_bench(bench_name, place.root)
-    earlier = open_run(place.runs / resume) if resume else None
+    earlier = place.run(resume) if resume else None
     plan = plan_test(place, place.specimen(specimen), method, bench_config, earlier)
     for line in _screen(plan, bench_config.name):
         say(line)
@@ -86,9 +94,9 @@ def run_command(
 
 
 @command.command("analyse")
-@click.argument("runs", nargs=-1)
+@click.argument("runs", nargs=-1, type=RUN_OR_SPECIMEN)
 @click.option("--group", "groups", multiple=True, metavar="NAME=RUN,RUN,…", help="Compare groups of runs.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Picture of all curves (SVG or PNG).")
+@click.option("-o", "--output", type=PictureFile(), help="Picture of all curves (SVG, PNG or PDF).")
 @json_option
 def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path | None, as_json: bool) -> None:
     """Analyse RUNS anew from their samples: run ids, folders, or specimens (all their runs)."""
@@ -121,7 +129,7 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
 
 
 @command.command("export")
-@click.argument("run")
+@click.argument("run", type=RUN)
 @click.option(
     "--format",
     "kind",
@@ -129,14 +137,13 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
     default="csv",
     show_default=True,
 )
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True)
+@click.option("-o", "--output", type=OutFile(), required=True)
 @json_option
 def export_command(run: str, kind: str, output: Path, as_json: bool) -> None:
     """Write the samples of RUN for other programs: CSV with units, Parquet, HDF5, or bluesky documents."""
     from fabctl.indent.export import export
-    from fabctl.indent.groups import find_run
 
-    found = export(find_run(lab(), run), kind, output)
+    found = export(lab().run(run), kind, output)
     show(found, as_json, [f"{output}: {found['rows_count']} rows"])
 
 

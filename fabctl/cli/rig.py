@@ -234,7 +234,7 @@ def _moved(bench_name: str, word: str, question: str, yes: bool, as_json: bool, 
 
 
 def _sampled(rig: Indenter, time_s: float) -> list[Sample]:
-    from fabctl.clock import WallClock
+    from drivers.clock import WallClock
 
     clock, found = WallClock(), []
     until_s = clock.now_s() + time_s

@@ -10,51 +10,53 @@ from pathlib import Path
 
 from design.bundle import Bundle, open_bundle
 from design.export.gcode import GcodeOptions
-from design.job import JobOptions, compose_job
+from design.job import compose_job
 from design.pattern.drawing import Box
 from design.pattern.paths import LAYERS, CutPath, Layer, LayerPreset
-from design.pattern.toolpath import ToolOptions
+from fabctl.config.coupon import CouponConfig
 from fabctl.config.loader import load
 from fabctl.config.material import MaterialConfig, load_material
 from fabctl.config.spec import SpecConfig
 from fabctl.cut.job import Compose
 from fabctl.cut.preflight import Sheet
+from fabctl.designing import job_options
 from fabctl.vision.ids import LARGEST, id_paths, id_size_modules, number_of
 
 SPOT_MM = 0.1  # of a laser whose bench file is not at hand
 PITCH_SPOTS = 1.5  # between strokes that fill an engraved area: charred rubber is wider than the spot
 
 
-def open_design(path: Path) -> tuple[Bundle, SpecConfig]:
-    """Return the design in a folder, checked against its hashes, and its specification."""
+def open_design(path: Path) -> tuple[Bundle, SpecConfig | CouponConfig]:
+    """Return the design or coupon in a folder, checked against its hashes, and what it was made from."""
     bundle = open_bundle(path)
+    if bundle.kind == "coupon":
+        return bundle, load(bundle.file("coupon.yaml"), CouponConfig)
     return bundle, load(bundle.file("spec.yaml"), SpecConfig)
 
 
-def sheet_of(spec: SpecConfig, home: Path) -> Sheet:
+def sheet_of(spec: SpecConfig | CouponConfig, home: Path) -> Sheet:
     """Return the sheet that the design was made for."""
     material = load_material(spec.material, home)
     return Sheet(material.name, material.thickness_mm)
 
 
 def composer(
-    bundle: Bundle, spec: SpecConfig, material: MaterialConfig, sheet: int | None = None, spot_mm: float = SPOT_MM
+    bundle: Bundle,
+    spec: SpecConfig | CouponConfig,
+    material: MaterialConfig,
+    sheet: int | None = None,
+    spot_mm: float = SPOT_MM,
 ) -> Compose:
     """Return the function that makes the program for a specimen's id and a board's full power.
 
     `sheet`, from 1, is one of those that a design larger than the bed is split over; `spot_mm` is the beam's spot.
     """
-    tool = spec.tool.model_dump(exclude={"kerf_mm", "spread_mm"})
-    kerf_mm = spec.tool.kerf_mm or (material.laser.kerf_mm if material.laser is not None else 0.1)
+    kerf_mm = material.laser.kerf_mm if material.laser is not None else 0.1
     presets = presets_of(material)
     drawing = bundle.drawing(sheet)
 
     def compose(specimen: str, s_max_count: float) -> tuple[str, ...]:
-        options = JobOptions(
-            tool=ToolOptions(kerf_mm=kerf_mm, **tool),
-            machine=GcodeOptions(s_max_count=s_max_count),
-            spread_mm=spec.tool.spread_mm,
-        )
+        options = job_options(spec.tool, kerf_mm, GcodeOptions(s_max_count=s_max_count))
         id_text = specimen if drawing.id_anchor is not None else ""
         code = code_strokes(specimen, drawing.code_box, spot_mm) if id_text and drawing.code_box else []
         return compose_job(drawing, presets, options, id_text, code).lines

@@ -135,6 +135,8 @@ def cut(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, dry_run: bool
     try:
         with laser_on(bench, log) as laser:
             plan = _plan(laser, bench, order, SAMPLE_ID)
+            if any(finding.code == "CUT-ZERO" for finding in plan.findings):
+                order = replace(order, frame=True)  # where zero is, only the operator knows: let it be seen
             _tell_findings(plan.findings, desk.emit)
             _refuse(plan.findings)
             if dry_run:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from drivers.clock import Clock, WallClock
 from drivers.errors import DeviceError
 from drivers.rig.indenter import Indenter
-from fabctl.clock import Clock, WallClock
 from fabctl.config.bench import RigConfig
 from fabctl.config.method import Approach, Cycles, LimitsConfig, MethodConfig, Tare
 from fabctl.errors import FabctlError

@@ -13,22 +13,16 @@ from fabctl.errors import RecordError, UsageError
 from fabctl.indent.analysis import Numbered, analyse, conditioning_curves, read_samples, summarise_run
 from fabctl.indent.compare import Ratio, bca, describe, fieller
 from fabctl.indent.plot import draw_curves
-from fabctl.records.folder import RunFolder, open_run, status_of
+from fabctl.records.folder import RunFolder, status_of
 from fabctl.workspace import SPECIMEN, Workspace
 
 COMPARED = ("stiffness_initial_N_mm", "stiffness_secant_N_mm", "force_max_N", "load_energy_mJ", "barrier_mJ")
 
 
-def find_run(lab: Workspace, name: str) -> RunFolder:
-    """Return one run by its id or folder."""
-    path = Path(name)
-    return open_run(path if path.is_dir() else lab.runs / name)
-
-
 def find_runs(lab: Workspace, name: str) -> list[RunFolder]:
     """Return the runs a word means: a run, or all tests of a specimen that hold samples."""
     if not SPECIMEN.fullmatch(name):
-        return [find_run(lab, name)]
+        return [lab.run(name)]
     found = [run for run in lab.runs_of(name, "indent") if (run.path / "samples.csv").is_file()]
     if not found:
         raise UsageError(f"{name} has no test yet; `fabctl indent run {name}` makes one")

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from design.findings import Finding, errors
+from drivers.clock import Clock, WallClock
 from drivers.errors import DeviceError
 from drivers.rig.indenter import Identity, open_indenter
 from drivers.rig.registers import RegisterMap
 from fabctl.bench import Bench, refuse_without
-from fabctl.clock import Clock, WallClock
 from fabctl.config.bench import BenchConfig, RigConfig, find
 from fabctl.config.method import MethodConfig, load_method
 from fabctl.config.rig import load_rig
@@ -221,16 +221,34 @@ def _refuse_rig(plan: IndentPlan, identity: Identity) -> None:
             Finding(
                 "RIG-CAPACITY",
                 f"the limit {plan.method.limits.force_N:g} N is above the load cell's {identity.capacity_N:g} N",
+                hint="lower limits.force_N in the method",
+                value=plan.method.limits.force_N,
+                unit="N",
+                limit=identity.capacity_N,
             )
         )
     if plan.method.limits.travel_mm > identity.travel_mm:
         found.append(
-            Finding("RIG-TRAVEL", f"travel {plan.method.limits.travel_mm:g} mm, the rig has {identity.travel_mm:g} mm")
+            Finding(
+                "RIG-TRAVEL",
+                f"travel {plan.method.limits.travel_mm:g} mm, the rig has {identity.travel_mm:g} mm",
+                hint="shorten limits.travel_mm in the method",
+                value=plan.method.limits.travel_mm,
+                unit="mm",
+                limit=identity.travel_mm,
+            )
         )
     fastest = max((a.speed_mm_s for a in plan.actions), default=0.0)
     if max(fastest, plan.method.travel_speed_mm_s) > identity.speed_max_mm_s:
         found.append(
-            Finding("RIG-SPEED", f"a step asks for {fastest:g} mm/s, the rig reaches {identity.speed_max_mm_s:g} mm/s")
+            Finding(
+                "RIG-SPEED",
+                f"a step asks for {fastest:g} mm/s, the rig reaches {identity.speed_max_mm_s:g} mm/s",
+                hint="slow the method down",
+                value=fastest,
+                unit="mm/s",
+                limit=identity.speed_max_mm_s,
+            )
         )
     if found:
         raise RefusedError(f"{identity.model} cannot run method {plan.method.name}", found)

@@ -28,6 +28,7 @@ from fabctl.config.method import (
     Zero,
 )
 from fabctl.errors import UsageError
+from fabctl.files import text_of
 
 Kind = Literal["tare", "approach", "preload", "zero", "load", "hold", "unload", "wait", "travel"]
 
@@ -135,12 +136,12 @@ class Predicted:
 def read_predicted(path: Path) -> Predicted:
     """Return a design's `response.csv`; raise `UsageError` where it is not one."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = text_of(path, "a design's response.csv").splitlines()
         rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
         depth = np.array([float(row["depth_mm"]) for row in rows])
         load = np.array([float(row["load_N"]) for row in rows])
-    except (OSError, KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{path}: not a response of a design: {fault}") from fault
+    except (KeyError, TypeError, ValueError) as fault:
+        raise UsageError(f"{path}: not a response of a design: no numbers under depth_mm and load_N") from fault
     if not lines or not lines[0].startswith("# fabctl response 1") or len(depth) < 2:
         raise UsageError(f"{path}: not a response of version 1")
     facts = dict(part.strip().split("=", 1) for part in lines[0].split(";")[1:] if "=" in part)
@@ -189,6 +190,9 @@ def check(
                 "METHOD-FORCE",
                 f"the method's limit {method.limits.force_N:g} N is above the bench's {rig.force_limit_N:g} N",
                 where="limits.force_N",
+                value=method.limits.force_N,
+                unit="N",
+                limit=rig.force_limit_N,
             )
         )
     if method.limits.travel_mm > rig.travel_mm:
@@ -197,6 +201,9 @@ def check(
                 "METHOD-TRAVEL",
                 f"the method's travel {method.limits.travel_mm:g} mm is longer than the rig's {rig.travel_mm:g} mm",
                 where="limits.travel_mm",
+                value=method.limits.travel_mm,
+                unit="mm",
+                limit=rig.travel_mm,
             )
         )
     if any(action.kind == "travel" for action in plan) and not has_stage:
@@ -208,6 +215,9 @@ def check(
                     "METHOD-STEP-FORCE",
                     f"{action.kind} to {action.force_N:g} N reaches the limit of {method.limits.force_N:g} N",
                     hint="the limit acts on the untared force; leave room",
+                    value=action.force_N,
+                    unit="N",
+                    limit=method.limits.force_N,
                 )
             )
     deepest = max((a.depth_mm for a in plan if a.kind == "load" and a.depth_mm is not None), default=None)
@@ -226,6 +236,9 @@ def _against(predicted: Predicted, deepest_mm: float, method: MethodConfig, rig:
             f"pressed to {deepest_mm:g} mm the specimen is predicted to answer with {peak_N:.2f} N, "
             f"the limit is {method.limits.force_N:g} N",
             hint="load less deep, or raise limits.force_N",
+            value=peak_N,
+            unit="N",
+            limit=method.limits.force_N,
         )
     if deepest_mm > predicted.depth_mm[-1]:
         yield Finding(

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from design.findings import Finding
+from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.rig.indenter import Indenter, Limits, ended
 from drivers.rig.samples import Sample
-from fabctl.clock import Clock
 from fabctl.config.method import MethodConfig
 from fabctl.errors import FabctlError, RefusedError
 from fabctl.events import Emit, Event, silent

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Literal, Protocol
 
+from drivers.clock import Clock
 from drivers.errors import DeviceRefused, DeviceTimeout
 from drivers.rig.indenter import LOST, Indenter, RigFaulted
 from drivers.rig.samples import Restarted, Sample
-from fabctl.clock import Clock
 from fabctl.errors import Stopped
 from fabctl.events import Emit, Event
 from fabctl.indent.method import Action

@@ -78,6 +78,30 @@ def test_two_sides_need_a_beam_finer_than_the_slit() -> None:
         strokes_of([CutPath("slit", SQUARE_mm[:3])], ToolOptions(KERF_mm, slit_width_mm=0.1, slit_sides="both"))
 
 
+def test_a_slit_that_bends_close_to_its_end_is_shortened_round_the_bend() -> None:
+    line = np.array([[0.0, 0.0], [0.04, 0.0], [0.04, 5.0]])
+    (stroke,) = strokes_of([CutPath("slit", line)], ToolOptions(KERF_mm))
+    assert stroke.points_mm == pytest.approx(np.array([[0.04, 0.06], [0.04, 4.9]]))
+
+
+@pytest.mark.parametrize("loop_mm", [SQUARE_mm[::-1] * [1, 0.02], SQUARE_mm[::-1] * 0.01])
+def test_a_lead_in_never_burns_the_other_side_of_a_narrow_opening(loop_mm: np.ndarray) -> None:
+    path = CutPath("hole", loop_mm, closed=True)
+    void = shapely.Polygon(loop_mm).buffer(1e-6)
+    assert burnt(strokes_of([path], ToolOptions(KERF_mm, lead_in_mm=1.0, overcut_mm=0.3))).within(void)
+
+
+def test_a_lead_in_begins_where_there_is_room_beside_the_piece() -> None:
+    tag = shapely.box(0, 0, 40, 10).union(shapely.box(18, 10, 22, 11)).union(shapely.box(0, 11, 40, 30))  # a 1 mm gap
+    loop_mm = np.asarray(tag.exterior.coords)[:-1]
+    loop_mm = loop_mm if signed_area_mm2(loop_mm) > 0 else loop_mm[::-1]
+    for first in range(len(loop_mm)):
+        path = CutPath("outline", np.roll(loop_mm, first, axis=0), closed=True)
+        (stroke,) = strokes_of([path], ToolOptions(KERF_mm, lead_in_mm=1.5))
+        assert np.linalg.norm(stroke.points_mm[1] - stroke.points_mm[0]) == pytest.approx(1.5)
+        assert burnt([stroke]).intersection(tag).area < 1e-4
+
+
 def test_the_lead_in_starts_in_the_waste_and_the_overcut_passes_the_start() -> None:
     options = ToolOptions(KERF_mm, lead_in_mm=1.5, overcut_mm=0.8)
     for loop, layer in ((SQUARE_mm, "outline"), (SQUARE_mm[::-1], "outline"), (SQUARE_mm, "hole")):
