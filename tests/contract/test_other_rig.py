@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -155,25 +152,3 @@ def test_another_rig_on_a_real_line_is_asked_tared_and_goes_through_a_whole_meth
         found = bench.fabctl(*words, "short.yaml")
         assert found["stiffness_secant_N_mm"] == pytest.approx(0.5, rel=0.01)  # the simulator's spring
         bench.fabctl(*words, "grid", expect=3)  # this rig's map has no stage
-
-
-def test_the_hardware_suite_takes_another_rigs_map(tmp_path: Path) -> None:
-    with simulated_rig("--tcp", "0", "--registers", "grams", "--unit", "17") as url:
-        words = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "tests/hardware/test_rig.py",
-            "-n",
-            "0",
-            "-p",
-            "no:cacheprovider",
-        ]
-        done = subprocess.run(
-            [*words, "--rig-url", url, "--allow-motion"],
-            cwd=Path(__file__).resolve().parents[2],
-            env={**os.environ, "RIG_MAP": "grams"},
-            capture_output=True,
-            text=True,
-        )
-    assert "3 passed" in done.stdout, done.stdout
