@@ -257,7 +257,7 @@ def _against(predicted: Predicted, deepest_mm: float, method: MethodConfig, rig:
 
 def _order(plan: Sequence[Action]) -> Iterator[Finding]:
     """Say where a step needs another before it."""
-    tared = found_contact = False
+    tared = found_contact = pressed = touching = False
     for k, action in enumerate(plan):
         where = f"step {k + 1} ({action.kind})"
         if action.kind == "travel":
@@ -272,3 +272,20 @@ def _order(plan: Sequence[Action]) -> Iterator[Finding]:
                 )
         elif action.kind in ("load", "preload", "zero", "unload") and not found_contact:
             yield Finding("METHOD-APPROACH", "no contact is known here", where=where, hint="add {step: approach}")
+        if action.kind == "tare" and touching:
+            text = "a tare while the specimen is pressed would take its force for zero"
+            yield Finding("METHOD-TARE-PRESSED", text, where=where, hint="unload before it")
+        touching = _touches(action, touching)
+        if action.kind == "load" and pressed:
+            text = "this curve begins under a preload: without a zero after it nothing can be counted from contact"
+            yield Finding("METHOD-PRELOAD", text, "warning", where=where, hint="add {step: zero} after the preload")
+        pressed = action.kind == "preload" or (pressed and action.kind in ("hold", "wait", "tare"))
+
+
+def _touches(action: Action, before: bool) -> bool:
+    """Tell whether the indenter stands in contact after an action; `before` is how it stood."""
+    if action.kind in ("load", "preload"):
+        return True
+    if action.kind == "unload":
+        return action.depth_mm is not None or action.force_N is not None
+    return before and action.kind not in ("approach", "travel")

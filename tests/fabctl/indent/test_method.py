@@ -71,6 +71,22 @@ def test_an_approach_without_a_tare_is_refused() -> None:
     assert "METHOD-TARE" in codes(method("  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"))
 
 
+def test_a_preload_without_a_zero_after_it_is_told() -> None:
+    begin = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"
+    preload = "  - {step: preload, force_N: 0.2, speed_mm_s: 1}\n"
+    load = "  - {step: load, depth_mm: 2, speed_mm_s: 1}\n"
+    assert "METHOD-PRELOAD" in codes(method(begin + preload + load))
+    assert "METHOD-PRELOAD" not in codes(method(begin + preload + "  - {step: zero}\n" + load))
+
+
+def test_a_tare_while_the_specimen_is_pressed_is_refused() -> None:
+    begin = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"
+    load, tare = "  - {step: load, depth_mm: 2, speed_mm_s: 1}\n", "  - {step: tare}\n"
+    for way_out, refused in (("", True), ("force_N: 0.1, ", True), (None, False)):
+        unload = "" if way_out == "" else f"  - {{step: unload, {way_out or ''}speed_mm_s: 1}}\n"
+        assert ("METHOD-TARE-PRESSED" in codes(method(begin + load + unload + tare))) == refused
+
+
 def test_a_predicted_force_above_the_limit_is_refused() -> None:
     stiff = Predicted(np.linspace(0, 10, 11), np.linspace(0, 20, 11))
     assert "METHOD-PREDICTED-FORCE" in codes(load_method("dome", NOWHERE), stiff)
