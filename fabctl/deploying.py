@@ -94,7 +94,7 @@ def divided(laid: Laid, parts: int) -> Laid:
 
 
 def wells_of(laid: Laid) -> Wells:
-    """Return each cell's whole energy curve; raise `RefusedError` where a cell has none, closes, or the seam is joined."""
+    """Return each cell's whole energy curve; raise `RefusedError` where there is none to follow."""
     if is_contracting(laid.library):
         fault = Finding("CASCADE-CLOSING", "the cells contract", hint="unit by unit goes with expanding cells only")
         raise RefusedError("the sheet cannot be opened cell by cell", [fault])
