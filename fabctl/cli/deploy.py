@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import json_option, lab, progress, show
+from fabctl.cli.paths import InFolder, OutFolder
 
 if TYPE_CHECKING:
     from design.deploy.newton import Equilibrium
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("design", type=click.Path(path_type=Path))
+@click.argument("design", type=InFolder())
 @click.option("--gravity", is_flag=True, help="Let the sheet's own weight act (along −z).")
 @click.option(
     "--support",
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 )
 @click.option("--cascade", "by_unit", is_flag=True, help="Open the sheet from flat, one unit after the other.")
 @click.option("--animation/--no-animation", default=True, help="Write the deployment as an animated picture.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder to write into [DESIGN-deployed].")
+@click.option("-o", "--output", type=OutFolder(), help="Folder to write into [DESIGN-deployed].")
 @json_option
 def command(
     design: Path,

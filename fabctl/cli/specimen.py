@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import json_option, lab, show
+from fabctl.cli.paths import SPECIMEN, InFile
 
 if TYPE_CHECKING:
     from fabctl.workspace import Specimen
-
-FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.group("specimen")
@@ -44,7 +43,7 @@ def _record_or_fault(specimen: Specimen) -> dict[str, Any]:
 
 
 @command.command("show")
-@click.argument("name")
+@click.argument("name", type=SPECIMEN)
 @json_option
 def show_specimen(name: str, as_json: bool) -> None:
     """Show what is written about a specimen, and its runs."""
@@ -58,7 +57,7 @@ def show_specimen(name: str, as_json: bool) -> None:
 
 
 @command.command("note")
-@click.argument("name")
+@click.argument("name", type=SPECIMEN)
 @click.argument("facts", nargs=-1, required=True, metavar="KEY=VALUE…")
 @json_option
 def note(name: str, facts: tuple[str, ...], as_json: bool) -> None:
@@ -84,17 +83,17 @@ def _fact(text: str) -> tuple[str, Any]:
 
 
 @command.command("read")
-@click.argument("image", type=FILE)
+@click.argument("image", type=InFile())
 @json_option
 def read(image: Path, as_json: bool) -> None:
     """Read the engraved ids in a picture, and say which runs they have."""
     from design.findings import Finding, errors
-    from drivers.camera import read_picture
     from fabctl.errors import RefusedError
+    from fabctl.files import picture_of
     from fabctl.vision.ids import read_ids
     from fabctl.vision.quality import picture_findings
 
-    frame = read_picture(image)
+    frame = picture_of(image)
     found = picture_findings(frame.image, frame.source)
     ids = [] if errors(found) else read_ids(frame.image)
     if not ids:

@@ -24,7 +24,7 @@ from fabctl.errors import RefusedError
 from fabctl.vision.align import mark_findings
 from fabctl.vision.boards import MarkSheet
 from fabctl.vision.coupon import Coupon, Slit, Window, powers_of
-from fabctl.vision.markers import Marker, find_markers
+from fabctl.vision.markers import Marker, find_all
 from fabctl.vision.profile import ToPixels, across, linear_light, missing
 from fabctl.vision.quality import picture_findings
 from fabctl.vision.template import F64, homography, look, warp
@@ -73,7 +73,7 @@ def measure(image: NDArray[np.uint8], source: str, coupon: Coupon, gamma: str = 
     if errors(found):
         raise RefusedError("the picture cannot be measured in", found)
     ids = {mark.id for mark in coupon.marks.marks}
-    markers = [m for m in find_markers(image, coupon.marks.family, inverted=True) if m.id in ids]
+    markers = [m for m in find_all(image, coupon.marks.family, inverted=True) if m.id in ids]
     found += mark_findings(markers, image, coupon.marks, 4)
     if errors(found):
         raise RefusedError("the coupon's marks are not found", found)
