@@ -39,11 +39,11 @@ def bound_mm(ends_mm: Array, tour_mm: float) -> float:
         loose = np.argpartition(price, 2)[:2]  # where the path begins and ends
         value = (tree.data[moves] - LIFT_MM).sum() + price[loose].sum() - price.sum()
         if value > best:
-            best, best_price = value, price
+            best, best_price = value, price.copy()
         count = np.bincount(tree.coords[0], minlength=n) + np.bincount(tree.coords[1], minlength=n)
         count[loose] += 1
         over = count - 2.0
-        price = price + step_mm * (0.7 * over + 0.3 * (before if number else over))
+        price += step_mm * (0.7 * over + 0.3 * (before if number else over))
         before, step_mm = over, step_mm * SHRINK_RATIO
     return float(_tree_mm(ends_mm, best_price) + np.sort(best_price)[:2].sum() - 2 * best_price.sum())
 

@@ -144,7 +144,7 @@ def _places_apart_mm(corners_mm: Reals, faces: NDArray[np.int64]) -> Reals:
     high = -low
     np.minimum.at(low, faces.ravel(), corners_mm.reshape(-1, 2))
     np.maximum.at(high, faces.ravel(), corners_mm.reshape(-1, 2))
-    return high - low
+    return np.asarray(high - low, dtype=np.float64)
 
 
 def _goal_mm(layout: Layout, paper: TriMesh, target: TriMesh) -> Reals:
