@@ -102,10 +102,15 @@ def paused() -> list[str]:
     return [*lines, "M5", "M9", "G4P0.01"]
 
 
-def dense_job() -> list[str]:
+def dense_job(feed: int = 1500) -> list[str]:
     """Return 0.1 mm pieces: as dense as a traced curve gets."""
     points = [(-150 + 30 * math.cos(k / 300), -100 + 30 * math.sin(k / 300)) for k in range(1200)]
-    return [*HEAD, *polyline(points, 1500, 500), *TAIL]
+    return [*HEAD, *polyline(points, feed, 500), *TAIL]
+
+
+def timed_jobs() -> dict[str, list[str]]:
+    """Return the jobs whose time is estimated: the look-ahead of fifteen moves is what bounds the last one."""
+    return {**JOBS, "dense": dense_job(), "hurried": dense_job(6000)}
 
 
 JOBS: dict[str, list[str]] = {

@@ -11,7 +11,7 @@ from drivers.errors import TransportError
 from drivers.grbl.laser import Laser
 from drivers.grbl.run import Progress, Wish
 from drivers.transport.memory import MemoryTransport
-from simulators.faults import Fault
+from simulators.faults import SLOW_S, Fault
 from simulators.grbl.board import Board, Point
 from simulators.grbl.dialects import GRBL, Dialect
 from simulators.grbl.machine import Machine, State, World
@@ -113,6 +113,9 @@ class Rig:
         if self.fault.restart:
             self.fault.restart = False
             self.board.restart()
+        if self.fault.crawl:
+            self.fault.crawl = False
+            self.board.machine.stepper.linger_s = SLOW_S
         if self.fault.unplug:
             self.unplugged = True
             self.fault.unplug = False
@@ -127,12 +130,17 @@ class Watch:
     clock: VirtualClock | None = None
     limit: int | None = None
     reports: list[Progress] = field(default_factory=list)
+    since_s: Callable[[], float] | None = None  # from this moment on, the first report of standstill is noted
+    idle_s: float | None = None
 
     def limit_count(self, now_s: float) -> int | None:
         return self.limit
 
     def seen(self, progress: Progress, now_s: float) -> None:
         self.reports.append(progress)
+        if self.idle_s is None and self.since_s is not None and progress.report is not None:
+            at_rest = progress.report.state == "Idle" and now_s > self.since_s()
+            self.idle_s = now_s if at_rest else None
 
     def wish(self) -> Wish:
         if self.wishes and self.clock is not None and self.clock.now_s() >= self.wishes[0][0]:

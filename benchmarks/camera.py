@@ -1,13 +1,16 @@
 """What the camera measures, against simulated pictures whose truth is known.
 
 `python -m benchmarks camera [--quick] [PART…]`; `--quick` takes a tenth of the pictures; the parts are bed, kerf,
-inspection, scale, nothing, ids, refusals. Nothing here is fitted to the truth: each figure runs the product's own path
-from pictures to millimetres, the lens calibration included.
+inspection, scale, nothing, ids, refusals. Each part's figures go to the error stream as soon as it ends, and a part
+that breaks off is one missed figure, so that none costs another its figures. Nothing here is fitted to the truth: each
+figure runs the product's own path from pictures to millimetres, the lens calibration included.
 """
 
 from __future__ import annotations
 
 import math
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -49,16 +52,29 @@ def measure(words: list[str]) -> list[Figure]:
     """Return every figure of the camera, or of the named parts."""
     quick = "--quick" in words
     parts: dict[str, Callable[[], list[Figure]]] = {
-        "bed": lambda: _bed(1 if quick else 3),
+        "bed": lambda: _bed(1 if quick else 5),
         "kerf": lambda: _kerf(1 if quick else 4),
         "inspection": lambda: _inspection(1 if quick else 3),
-        "scale": lambda: _scale(1 if quick else 5),
+        "scale": lambda: _scale(1 if quick else 20),
         "nothing": lambda: _nothing(100 if quick else 1000),
-        "ids": lambda: _ids(40 if quick else 400),
+        "ids": lambda: _ids(40 if quick else 1000),
         "refusals": _refusals,
     }
     chosen = [word for word in words if word in parts] or list(parts)
-    return [figure for name in chosen for figure in parts[name]()]
+    return [figure for name in chosen for figure in _told(name, parts[name])]
+
+
+def _told(name: str, part: Callable[[], list[Figure]]) -> list[Figure]:
+    """Return a part's figures, or the one that says why there are none; tell them on the error stream as well."""
+    began_s = time.monotonic()
+    try:
+        figures = part()
+    except (RefusedError, DeviceError) as fault:
+        figures = [Figure(f"{name}: broken off", str(fault), "", "no refusal", False, 0)]
+    took = f"{name}, {time.monotonic() - began_s:.0f} s"
+    for figure in figures:
+        print(f"[{took}] {figure.name}: {figure.value} {figure.unit} n={figure.n} met={figure.met}", file=sys.stderr)
+    return figures
 
 
 def _camera(seed: int) -> scenes.Camera:
@@ -126,13 +142,17 @@ def _sheet_error(picture: Picture, alignment: Alignment, pose: scenes.Pose) -> f
 
 def _kerf(coupons: int) -> list[Figure]:
     coupon = make_coupon([0.5, 0.6, 0.75], 25.0)
-    errors, covered, front = [], [], []
+    errors, covered, front, refused = [], [], [], []
     for seed in range(coupons):
         rng = np.random.default_rng([seed, 3])
         radii = rng.uniform(0.085, 0.12, 2)
         beam = scenes.Beam(float(radii[0]), float(radii[1]), char_at_ratio=float(rng.choice([0.1, 0.2, 0.3])))
         for over_light in (True, False):
-            found = measure_kerf(photograph_coupon(coupon, beam, over_light, seed), "coupon", coupon)
+            try:
+                found = measure_kerf(photograph_coupon(coupon, beam, over_light, seed), "coupon", coupon)
+            except RefusedError as fault:
+                refused.append(f"coupon {seed}: {fault}")
+                continue
             for width in found.widths:
                 true = kerf_mm(width.power_frac / 25.0, 0.0 if width.axis == "x" else math.pi / 2, beam)
                 error = width.kerf_mm - true
@@ -144,6 +164,7 @@ def _kerf(coupons: int) -> list[Figure]:
     n = len(errors)
     share = round(100 * float(np.mean(covered)), 1)
     return [
+        Figure("kerf: pictures refused", "; ".join(refused) or 0, "", "0", not refused, 2 * coupons),
         _most(
             "kerf over a light table, worst error",
             float(np.abs(errors).max()),
@@ -225,9 +246,17 @@ def _scale(scans: int) -> list[Figure]:
         errors.append(made.mm_per_unit_ratio / UNIT_MM - 1)
         covered.append(abs(errors[-1]) <= made.uncertainty_ratio)
     note = "<= 0.02 % (12 pictures, poses as a bundle adjustment leaves them)"
+    told = f">= 90 % (k = 2: 95 %, less what {scans} scans leave open)"
     return [
         _most("scan scale by marks, worst error", 100 * float(np.abs(errors).max()), "%", 0.02, note, scans),
-        Figure("scan scale, errors within the stated uncertainty", sum(covered), "", "", None, scans),
+        Figure(
+            "scan scale, errors within the stated uncertainty",
+            round(100 * sum(covered) / scans, 1),
+            "%",
+            told,
+            sum(covered) >= 0.9 * scans,
+            scans,
+        ),
     ]
 
 
@@ -257,7 +286,7 @@ def _shots(seed: int) -> list[tuple[ShotPose, dict[int, F64]]]:
 
 
 def _nothing(count: int) -> list[Figure]:
-    rng = np.random.default_rng(6)
+    rng = np.random.default_rng(26)
     marks = ids = 0
     for k in range(count):
         picture = no_marker(k, rng)
@@ -270,7 +299,7 @@ def _nothing(count: int) -> list[Figure]:
 
 
 def _ids(count: int) -> list[Figure]:
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(27)
 
     def inside() -> Condition:
         return Condition(
@@ -291,7 +320,7 @@ def _ids(count: int) -> list[Figure]:
     rows = (
         ("ids read, conditions drawn evenly", inside, limits, count),
         ("ids read, all at the limit, module 3 px as seen in the picture", corner_as_seen, limits, count // 2),
-        ("ids read, all at the limit, module 3 px before the tilt", corner, "", count // 2),
+        ("ids read, all at the limit, module 3 px before the tilt", corner, limits, count // 2),
     )
     return [figure for name, draw, target, n in rows for figure in _read_share(name, draw, target, n, rng)]
 

@@ -1,7 +1,8 @@
-"""The laser room's figures: `python -m benchmarks laser [--url URL] [--quick]`.
+"""The laser room's figures: `python -m benchmarks laser [PART…] [--url URL [--allow-motion]] [--quick]`.
 
-Without `--url`, on the simulated board in virtual time, which makes every figure repeatable. With `--url`, those that
-need no motion are measured on whatever answers there.
+Without `--url`, on the simulated board in virtual time, which makes every figure repeatable; the recorded dialogues are
+looked for beside the project or in `FABCTL_SHARED`. With `--url`, lines/s and reaction times are measured on whatever
+answers there, and with `--allow-motion` (at most 5 mm, beam off) the estimate of a small job too.
 """
 
 from __future__ import annotations
@@ -14,10 +15,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import Figure
-from benchmarks._laser_jobs import JOBS, burnt_against, dense_job
+from benchmarks._laser_dialogues import differences, recorded_job, rows_of
+from benchmarks._laser_endpoint import motion, reactions, ready
+from benchmarks._laser_jobs import JOBS, burnt_against, timed_jobs
 from benchmarks._laser_kills import KILLS, RUN_ON_S, killed_run, missing_count, resumed, twice_mm
 from benchmarks._laser_kills import PROGRAM as KILL_PROGRAM
 from benchmarks._laser_rig import Rig, Watch, lit_while_standing, slits
@@ -27,6 +31,7 @@ from drivers.grbl.faults import BoardRestarted, DoubledOk, GarbledLine, LinkStal
 from drivers.grbl.laser import Laser
 from drivers.grbl.run import StoppedByOperator, run_program
 from drivers.transport import open_transport
+from fabctl.cut.estimate import Dynamics, estimate
 from fabctl.cut.execute import run_plan
 from fabctl.cut.place import Affine
 from fabctl.cut.plan import CutPlan, program_times
@@ -45,6 +50,7 @@ EXPECTED: dict[str, type[Exception] | None] = {
     "banner": BoardRestarted,
     "unplug": TransportError,
     "stall": LinkStalled,
+    "slow": None,
 }
 
 
@@ -53,41 +59,62 @@ def measure(words: list[str]) -> list[Figure]:
     quick = "--quick" in words
     url = words[words.index("--url") + 1] if "--url" in words else None
     if url is not None:
-        return [*throughput(url, 5_000 if quick else 100_000), reaction(url)]
-    return [
-        *throughput(None, 5_000 if quick else 100_000),
-        pacer(),
-        *burn(),
-        *faults(4 if quick else SEEDS_COUNT),
-        slow_move(),
-        *pin(),
-        *kills(10 if quick else len(KILLS)),
-        *estimates(),
-    ]
+        there = [*throughput(url, 5_000 if quick else 100_000), *reactions(url)]
+        return [*there, *motion(url)] if "--allow-motion" in words else there
+    parts: dict[str, Callable[[], list[Figure]]] = {
+        "dialogues": dialogues,
+        "throughput": lambda: throughput(None, 5_000 if quick else 100_000),
+        "pacer": pacer,
+        "burn": burn,
+        "faults": lambda: faults(4 if quick else SEEDS_COUNT),
+        "slow-move": slow_move,
+        "pin": pin,
+        "kills": lambda: [*kills(10 if quick else len(KILLS)), *short_slits(2 if quick else 9)],
+        "estimates": estimates,
+    }
+    chosen = [name for name in parts if name in words] or list(parts)
+    return [figure for name in chosen for figure in parts[name]()]
 
 
-def nine_bytes(count: int) -> list[str]:
-    """Return lines that are 9.3 bytes long on average, newline included."""
-    return [
-        "G21G90",
-        "G1F1000",
-        *(f"X{k % 90 + 10}.5Y{k % 70 + 10}" + (".5" if k % 20 < 3 else "") for k in range(count)),
-    ]
+def dialogues() -> list[Figure]:
+    """Replay the recorded dialogues against the simulated board."""
+    folder = Path(os.environ.get("FABCTL_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+    paths = sorted((folder / "laser" / "grbl-1.1h-dialogues").glob("*.jsonl"))
+    same = sum(not differences(rows_of(path)) for path in paths)
+    asked = "all, to the byte but for status numbers" if paths else "not measured: no recordings here"
+    met = same == len(paths) if paths else None
+    found = [Figure("recorded dialogues answered alike", f"{same}/{len(paths)}", "", asked, met, len(paths))]
+    motion_path = folder / "laser" / "grbl-1.1h-dialogues" / "motion.jsonl"
+    if motion_path.exists():
+        lines, took_s = recorded_job(motion_path)
+        board = Dynamics.of({1: 25, 100: 250, 101: 250, 110: 6000, 111: 6000, 120: 500, 121: 500})
+        error = estimate(read_program(lines).steps, board).total_s / took_s - 1
+        name = f"time estimate of the recorded job of {took_s:.2f} s"
+        found.append(Figure(name, round(100 * error, 1), "%", "within 2 %", abs(error) <= 0.02, 1))
+    return found
+
+
+def nine_bytes(count: int, positive: bool = False) -> list[str]:
+    """Return lines that are 9.3 bytes long on average, newline included, within 100 × 80 mm of the travel.
+
+    Check mode obeys soft limits: machine space is negative, or positive where the firmware homes to zero.
+    """
+    x, y = ("X{}.5", "Y{}") if positive else ("X-{}", "Y-{}")
+    moves = (x.format(k % 90 + 10) + y.format(k % 70 + 10) + (".5" if k % 20 < 3 else "") for k in range(count))
+    return ["G21G90", "G1F1000", *moves]
 
 
 def throughput(url: str | None, count: int) -> list[Figure]:
     """Measure check-mode lines per second on a paced line, against the wire's own limit for these lines."""
-    lines = nine_bytes(count)
-    mean_bytes = sum(len(line) + 1 for line in lines) / len(lines)
     with tempfile.TemporaryDirectory() as folder:
         process, address = (None, url) if url else start_board(Path(folder) / "port")
         try:
             with Laser(open_transport(str(address))) as laser:
-                laser.connect()
-                if laser.report().state == "Alarm":
-                    laser.unlock()
+                identity = ready(laser).identity
+                assert identity is not None
+                lines = nine_bytes(count, identity.homes_to_zero)
                 began_s = time.perf_counter()
-                refused = check_program(laser.link, lines, laser.identity.rx_bytes if laser.identity else 128)
+                refused = check_program(laser.link, lines, identity.rx_bytes)
                 took_s = time.perf_counter() - began_s
                 laser.end()
         finally:
@@ -95,6 +122,7 @@ def throughput(url: str | None, count: int) -> list[Figure]:
                 process.terminate()
                 process.wait()
     rate = len(lines) / took_s
+    mean_bytes = sum(len(line) + 1 for line in lines) / len(lines)
     wire = 11_520 / mean_bytes
     return [
         Figure(f"check-mode throughput, {mean_bytes:.1f} B lines", round(rate), "lines/s",
@@ -111,7 +139,7 @@ def start_board(port: Path, *more: str) -> tuple[subprocess.Popen[str], str]:
     return process, process.stdout.readline().split()[1]
 
 
-def pacer() -> Figure:
+def pacer() -> list[Figure]:
     """Measure the fastest second of the simulated line, host to board, in virtual time."""
     rig = Rig()
     arrivals: list[float] = []
@@ -127,9 +155,11 @@ def pacer() -> Figure:
     worst = max((k + 11_520 for k in range(0, len(arrivals) - 11_520, 97)), default=0)
     fastest = min((arrivals[k] - arrivals[k - 11_520] for k in range(11_520, worst)), default=math.inf)
     rate = 11_520 / fastest
-    return Figure(
-        "the pacer's fastest second", round(rate, 1), "B/s", "never above 11,520", rate <= 11_520.5, len(arrivals)
-    )
+    return [
+        Figure(
+            "the pacer's fastest second", round(rate, 1), "B/s", "never above 11,520", rate <= 11_520.5, len(arrivals)
+        )
+    ]
 
 
 def burn() -> list[Figure]:
@@ -168,8 +198,9 @@ def faults(seeds_count: int) -> list[Figure]:
                 )
             )
             caught: type[Exception] | None = None
+            watch = Watch(since_s=lambda rig=rig: _done_s(rig))  # type: ignore[misc]
             try:
-                run_program(laser, program, Watch())
+                run_program(laser, program, watch)
             except DeviceError as fault:
                 caught = type(fault)
             total += 1
@@ -177,8 +208,11 @@ def faults(seeds_count: int) -> list[Figure]:
             sent = re.sub(rb"[?!~\x18\x80-\xff]", b"", bytes(rig.sent)).decode().split("\n")
             lines = [line for line in sent if line and line[0] != "$"]
             resent += lines != program[: len(lines)]
-            if rig.fault is not None and rig.fault.done_s is not None and kind in ("corrupt", "banner", "stall"):
-                slowest_s = max(slowest_s, stops[0] - rig.fault.done_s)
+            if expected is not None:
+                # a lost answer shows at standstill only, a doubled one there at the latest
+                evidence_s = watch.idle_s if kind in ("lost-ok", "double-ok") else _done_s(rig)
+                acted_s = stops[0] if stops else rig.clock.now_s()
+                slowest_s = max(slowest_s, acted_s - (evidence_s or acted_s))
     return [
         Figure("faults classified rightly", f"{right}/{total}", "", "each × 20 seeds, all", right == total, total),
         Figure("slowest reaction to the evidence", round(slowest_s, 3), "s", "within 1 s", slowest_s < 1.0, total),
@@ -186,7 +220,11 @@ def faults(seeds_count: int) -> list[Figure]:
     ]
 
 
-def slow_move() -> Figure:
+def _done_s(rig: Rig) -> float:
+    return math.inf if rig.fault is None or rig.fault.done_s is None else rig.fault.done_s
+
+
+def slow_move() -> list[Figure]:
     """Run a single move of 60 s and see that nobody takes it for a stall."""
     rig = Rig()
     laser = rig.laser()
@@ -198,9 +236,11 @@ def slow_move() -> Figure:
     except DeviceError:
         healthy = False
     took_s = rig.clock.now_s() - begun_s
-    return Figure(
-        "a healthy move of 60 s runs through", round(took_s, 1), "s", "never aborted", healthy and took_s > 60, 1
-    )
+    return [
+        Figure(
+            "a healthy move of 60 s runs through", round(took_s, 1), "s", "never aborted", healthy and took_s > 60, 1
+        )
+    ]
 
 
 def pin() -> list[Figure]:
@@ -266,15 +306,31 @@ def kills(count: int) -> list[Figure]:
     ]  # fmt: skip
 
 
+def short_slits(count: int) -> list[Figure]:
+    """Kill cuts of slits shorter than two status reports, the position lost."""
+    found = []
+    for length_mm in (1.0, 2.0):
+        program = read_program(slits(30, length_mm=length_mm))
+        worst_mm, missing = 0.0, 0
+        for seed in range(count):
+            rig, rows, died_s = killed_run(seed, program, absence_s=(0.0, 0.4, 8.0)[seed % 3])
+            resumed(rig, rows, program, died_s, restart=True)
+            worst_mm, missing = max(worst_mm, twice_mm(rig, program)), missing + missing_count(rig, program)
+        name = f"burnt twice per kill, position lost, slits of {length_mm:g} mm"
+        met = worst_mm <= length_mm and missing == 0
+        found.append(Figure(name, round(worst_mm, 2), "mm", f"<= one slit ({length_mm:g} mm)", met, count))
+    return found
+
+
 def estimates() -> list[Figure]:
-    """Compare the estimated time of eleven jobs, run as a cut runs them, with the simulated board's own.
+    """Compare the estimated time of twelve jobs, run as a cut runs them, with the simulated board's own.
 
     Both count from the first line until the board is seen standing at the end, as a cut's record does. What the host
     listens on after that, with the board standing, is told beside it.
     """
     errors: list[tuple[float, str]] = []
     listened_s = 0.0
-    for name, lines in {**JOBS, "dense": dense_job()}.items():
+    for name, lines in timed_jobs().items():
         rig = Rig()
         rig.board.trace = None
         laser = rig.laser()
@@ -292,15 +348,3 @@ def estimates() -> list[Figure]:
                "within 2 %", abs(worst) <= 0.02, len(errors)),
         Figure("host before and after a job, the board standing", round(listened_s, 2), "s", "", None, len(errors)),
     ]  # fmt: skip
-
-
-def reaction(url: str) -> Figure:
-    """Measure how long a status question takes to be answered."""
-    with Laser(open_transport(url)) as laser:
-        laser.connect()
-        times = []
-        for _ in range(50):
-            began_s = time.perf_counter()
-            laser.report()
-            times.append(time.perf_counter() - began_s)
-    return Figure("answer to a status question", round(1000 * sorted(times)[len(times) // 2], 1), "ms", "", None, 50)

@@ -19,12 +19,16 @@ class DesignError(Exception):
         return "\n  ".join([self.message, *map(str, self.findings)])
 
 
+class UnreadableFile(DesignError):
+    """A file that somebody named is missing, empty, cut short, or not what its name says."""
+
+
 class MeshError(DesignError):
     """The target mesh cannot be used."""
 
 
-class UnreadableMesh(MeshError):
-    """The file is missing, empty, cut short, or not what its name says."""
+class UnreadableMesh(MeshError, UnreadableFile):
+    """The bytes are not a mesh."""
 
 
 class FlattenError(DesignError):
@@ -51,6 +55,10 @@ class BundleError(DesignError):
     """A design folder is missing a file, was edited after the build, or is of another version."""
 
 
+class NoBundle(BundleError, UnreadableFile):
+    """There is no design folder, or nothing in it that can be read as one."""
+
+
 class NotConverged(DesignError):
     """A solver stopped without an answer; says how far it came."""
 
@@ -59,4 +67,4 @@ class NotConverged(DesignError):
         super().__init__(
             f"{what} did not converge: residual {residual_ratio:.3g} after {iterations_count} iterations{tail}"
         )
-        self.what, self.residual_ratio, self.iterations_count = what, residual_ratio, iterations_count
+        self.what, self.residual_ratio, self.iterations_count, self.hint = what, residual_ratio, iterations_count, hint

@@ -2,7 +2,8 @@
 
 A fault sits between the board and the wire and sees what the board says. The kinds:
 `lost-ok`, `double-ok`, `corrupt` (one bit of one byte), `nul` (a byte 0 slipped in), `merged` (a line end lost between
-a report and what follows), `banner` (the board restarts), `unplug`, `stall` (nothing passes for `STALL_S`).
+a report and what follows), `banner` (the board restarts), `unplug`, `stall` (nothing passes for `STALL_S`), `slow`
+(the machine crawls for `SLOW_S`, which is healthy: it answers all the while).
 """
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass, field
 
-KINDS = ("lost-ok", "double-ok", "corrupt", "nul", "merged", "banner", "unplug", "stall")
-STALL_S = 8.0
+KINDS = ("lost-ok", "double-ok", "corrupt", "nul", "merged", "banner", "unplug", "stall", "slow")
+STALL_S, SLOW_S = 8.0, 60.0
 LINE_END = b"\r\n"
 
 
 @dataclass
 class Fault:
-    """One fault to come. `done_s` tells when it happened; `restart` and `unplug` ask the endpoint's owner to act."""
+    """One fault to come. `done_s` tells when it happened; `restart`, `unplug`, `crawl` ask the endpoint to act."""
 
     kind: str
     seed: int
@@ -26,6 +27,7 @@ class Fault:
     done_s: float | None = None
     restart: bool = False
     unplug: bool = False
+    crawl: bool = False
     stalled_until_s: float = 0.0
     _oks: int = 0
     _partial: bytes = b""
@@ -84,6 +86,8 @@ class Fault:
             self.restart = True
         elif self.kind == "unplug":
             self.unplug = True
+        elif self.kind == "slow":
+            self.crawl = True
         else:
             self.stalled_until_s = now_s + STALL_S
         return whole

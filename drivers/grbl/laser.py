@@ -24,6 +24,7 @@ from drivers.transport import Transport
 
 WAKE_S = 4.0  # a board that restarts when its port is opened needs up to two seconds
 HOLD_S = 1.0
+BRAKE_S = 10.0  # a heavy machine found in motion may take so long, once it obeys
 BANNER_S = 2.0
 BANNER_OFF_S = 1.0  # a reset in motion speaks after half a second
 SETTLE_S = 0.15
@@ -102,10 +103,13 @@ class Laser:
                 return
 
     def _stand_still(self) -> bool:
-        """Hold a moving board until it stands, at most `HOLD_S`; return whether it stands."""
+        """Hold a moving board until it stands; return whether it does. One that has not obeyed by `HOLD_S` is left."""
         report = self.link.report
-        end_s = self.clock.now_s() + HOLD_S
-        while report is not None and report.moving and self.clock.now_s() < end_s:
+        begun_s = self.clock.now_s()
+        while report is not None and report.moving:
+            obeys = report.state in ("Hold", "Door", "Jog")
+            if self.clock.now_s() - begun_s > (BRAKE_S if obeys else HOLD_S):
+                break
             self.link.send(HOLD + STATUS)
             self.link.wait_for(lambda m: isinstance(m, Report), STEP_WAIT_S)
             report = self.link.report

@@ -102,9 +102,10 @@ class _Run:
         if wish == "hold":
             self.held = True
             self.link.send(HOLD)
-        elif wish == "resume" and self.held:
+        elif wish == "resume":
             report = self.link.report
-            if report is not None and report.standing:
+            paused = self.held or (report is not None and report.state in ("Hold", "Door"))  # by its own button or door
+            if paused and report is not None and report.standing:
                 self.held = False
                 self.idle_since_s = None
                 self.link.send(START)
@@ -185,7 +186,9 @@ def run_program(laser: Laser, lines: Sequence[str], watcher: Watcher) -> Progres
         while not run.stream.done:
             run.step()
         stood_s = _await_standstill(run)
-    except BaseException:  # Ctrl-C too: the beam is off on every way out
+    except BaseException:
+        # KeyboardInterrupt too, which is no Exception. A second Ctrl-C cuts the waiting in `off` short, and one that
+        # breaks out of it meets `off` again on leaving the laser's `with` block.
         laser.off()
         raise
     laser.end()

@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from types import FrameType
 from typing import Any, TypeVar
 
 import click
 
-from fabctl.errors import BUG, DEVICE, DONE, OPERATOR, REFUSED, USAGE, FabctlError
+from fabctl.cli.paths import config_names
+from fabctl.cli.refusal import answer_no, exit_code_of, no_in_words, plain, refusal, sentence_of
+from fabctl.errors import BUG, DONE, OPERATOR, Stopped
 from fabctl.events import Emit, Event
 from fabctl.workspace import Workspace, workspace
 
+ERASE_TO_END = "\x1b[K"  # of the terminal's line, from the cursor
 F = TypeVar("F", bound=Callable[..., Any])
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 yes_option = click.option("--yes", is_flag=True, help="Answer every question with yes (for scripts).")
-bench_option = click.option("--bench", "bench_name", default="sim", show_default=True, help="Bench file or its name.")
+bench_option = click.option(
+    "--bench",
+    "bench_name",
+    type=config_names("benches"),
+    default="sim",
+    show_default=True,
+    help="Bench file or its name.",
+)
+MATERIAL = config_names("materials")
 
 
 def lab() -> Workspace:
@@ -31,16 +43,46 @@ def lab() -> Workspace:
 
 def say(text: str = "") -> None:
     """Tell the person something; standard error, so that standard output stays for results."""
+    _clear_line()
     click.echo(text, err=True)
 
 
-def show(data: dict[str, Any], as_json: bool, lines: Iterable[str]) -> None:
-    """Print the result: one JSON object, or `lines` for a person."""
+def _clear_line() -> None:
+    """Take away what a live line of progress has left: its cursor waits at the line's beginning."""
+    if sys.stderr.isatty():
+        click.echo(ERASE_TO_END, err=True, nl=False)
+
+
+def say_keys(text: str) -> None:
+    """Name the keys that act while a job runs, where there is a keyboard."""
+    if sys.stdin.isatty():
+        say(text)
+
+
+def show(data: dict[str, Any], as_json: bool, lines: Iterable[str], code: int = DONE, why: str = "") -> None:
+    """Print the result: one JSON object, or `lines` for a person.
+
+    A result that is a no ends the command with `code`, and the object says so: `error` is `why`, `exit_code` the code.
+    """
     if as_json:
-        click.echo(json.dumps(data, indent=1, default=str, allow_nan=False))
+        click.echo(_json(data if code == DONE else answer_no(data, code, why)))
+        for line in no_in_words(data, why) if code != DONE else ():
+            say(line)
     else:
+        _clear_line()
         for line in lines:
             click.echo(line)
+    if code != DONE:
+        click.get_current_context().exit(code)
+
+
+def _json(data: dict[str, Any]) -> str:
+    return json.dumps(plain(data), indent=1, default=_bare, allow_nan=False)
+
+
+def _bare(value: Any) -> Any:
+    """Return a NumPy scalar as Python's own number, and anything else as text."""
+    return value.item() if hasattr(value, "item") else str(value)
 
 
 def confirm(question: str, yes: bool) -> bool:
@@ -50,7 +92,11 @@ def confirm(question: str, yes: bool) -> bool:
     if not sys.stdin.isatty():
         say(f"{question} no (not a terminal; --yes answers yes)")
         return False
-    return click.confirm(question, default=False, err=True)
+    _clear_line()
+    try:
+        return click.confirm(question, default=False, err=True)
+    except click.exceptions.Abort:  # Ctrl-C or Ctrl-D at the question is an answer
+        raise Stopped("stopped at the question; nothing was begun") from None
 
 
 def progress() -> Emit:
@@ -62,13 +108,12 @@ def progress() -> Emit:
         if event.kind == "progress" and event.done_frac is not None:
             text = f"{event.done_frac:6.1%}  {event.message}"
             if live:
-                click.echo(f"\r\x1b[2K{text}", err=True, nl=False)
+                click.echo(f"{ERASE_TO_END}{text}\r", err=True, nl=False)
             elif int(event.done_frac * 10) != tenth[0]:
                 click.echo(text, err=True)
             tenth[0] = int(event.done_frac * 10)
         elif event.kind in ("stage", "state", "warning", "finding"):
-            lead = "\r\x1b[2K" if live else ""
-            click.echo(f"{lead}{event.message}", err=True)
+            say(event.message)
 
     return listen
 
@@ -101,42 +146,35 @@ def run_guarded(command: click.Command) -> int:
     """Run `command` and return its exit code (`fabctl.errors` lists them)."""
     signal.signal(signal.SIGTERM, _terminate)
     try:
-        code = command.main(standalone_mode=False)
+        code = command.main(prog_name="fabctl", standalone_mode=False)
         return int(code) if isinstance(code, int) else DONE
-    except click.exceptions.Abort:
-        say("stopped")
-        return OPERATOR
-    except KeyboardInterrupt:
-        say("stopped")
-        return OPERATOR
-    except click.ClickException as fault:
-        fault.show()
-        return USAGE
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
-    except Exception as fault:  # noqa: BLE001 - the outermost door: what is not known is a bug, and says so
+    except (Exception, KeyboardInterrupt) as fault:  # noqa: BLE001 - the outermost door: what is not known is a bug
         return _report(fault)
 
 
-def _report(fault: Exception) -> int:
-    # Imported here: on the good path `fabctl --help` must not pay for them.
-    from design.errors import DesignError, UnreadableMesh
-    from drivers.errors import DeviceError
+def _report(fault: BaseException) -> int:
+    """Tell a person on stderr and, where `--json` was asked for, a program on stdout; return the exit code."""
+    code = exit_code_of(fault)
+    if json_asked(sys.argv[1:]):
+        with contextlib.suppress(OSError):  # nobody listens any more, or the disk behind stdout is full
+            click.echo(_json(refusal(fault)))
+    if isinstance(fault, click.exceptions.Abort | KeyboardInterrupt):
+        say("stopped")
+    elif isinstance(fault, click.ClickException):
+        fault.show()
+    elif code == BUG:
+        _clear_line()
+        traceback.print_exception(fault, file=sys.stderr)
+        say("fabctl: this is a bug in fabctl; please report it with the lines above")
+    else:
+        say(f"fabctl: {sentence_of(fault)}")
+    return code
 
-    if isinstance(fault, FabctlError | DesignError | DeviceError):
-        code = REFUSED
-        if isinstance(fault, FabctlError):
-            code = fault.exit_code
-        elif isinstance(fault, DeviceError):
-            code = DEVICE
-        elif isinstance(fault, UnreadableMesh):
-            code = USAGE
-        say(f"fabctl: {fault}")
-        return code
-    if isinstance(fault, OSError):
-        say(f"fabctl: {fault.filename or 'storage'}: {fault.strerror or fault}")
-        return DEVICE if fault.errno == 28 else USAGE
-    traceback.print_exception(fault, file=sys.stderr)
-    say("fabctl: this is a bug in fabctl; please report it with the lines above")
-    return BUG
+
+def json_asked(words: Sequence[str]) -> bool:
+    """Tell whether the command line asks for JSON, also where it cannot be understood."""
+    options = words[: words.index("--")] if "--" in words else words
+    return "--json" in options

@@ -5,15 +5,21 @@ from __future__ import annotations
 import click
 
 from fabctl.cli.common import json_option, lab, show
-from fabctl.errors import DEVICE
+from fabctl.cli.paths import config_names
+from fabctl.errors import DEVICE, DONE
 
 
 @click.command("doctor")
-@click.option("--bench", "bench_name", help="Also look at this bench's devices (asks each who it is; nothing moves).")
+@click.option(
+    "--bench",
+    "bench_name",
+    type=config_names("benches"),
+    help="Also look at this bench's devices (asks each who it is; nothing moves).",
+)
 @json_option
-@click.pass_context
-def command(ctx: click.Context, bench_name: str | None, as_json: bool) -> None:
+def command(bench_name: str | None, as_json: bool) -> None:
     """Say what of this machine and bench works. Nothing moves and nothing is written."""
+    from design.findings import Finding
     from fabctl.health import bench_checks, machine_checks
 
     home = lab()
@@ -23,6 +29,6 @@ def command(ctx: click.Context, bench_name: str | None, as_json: bool) -> None:
     mark = {True: "ok  ", False: "FAIL"}
     lines = [f"{mark[c.works]} {c.what:28} {c.detail}" + (f"\n       {c.hint}" if c.hint else "") for c in checks]
     good = all(c.works for c in checks)
-    show({"works": good, "checks": [c.as_dict() for c in checks]}, as_json, lines)
-    if not good:
-        ctx.exit(DEVICE)
+    bad = [Finding("DOCTOR", c.detail, where=c.what, hint=c.hint) for c in checks if not c.works]
+    data = {"works": good, "checks": [c.as_dict() for c in checks], "findings": [f.as_dict() for f in bad]}
+    show(data, as_json, lines, DONE if good else DEVICE, f"{len(bad)} of {len(checks)} do not work")

@@ -16,7 +16,7 @@ from design.pattern.border import BorderOptions
 from design.pattern.slits import HingeOptions, HingeRule
 from design.pattern.tiling import Placement
 from design.pattern.toolpath import Sides, ToolOptions
-from design.spec import DesignSpec, Infeasible, Kind, Region, ResponseOptions
+from design.spec import DesignSpec, Infeasible, Kind, Region, ResponseOptions, Rim
 from fabctl.config.bench import Positive, find
 from fabctl.config.loader import Model, load
 
@@ -159,7 +159,7 @@ class SpecConfig(Model):
     border: BorderConfig = BorderConfig()
     tool: ToolConfig = ToolConfig()
     bed_mm: tuple[Positive, Positive] | None = None
-    compensate: bool = False
+    compensate: bool | Rim = False
     response: ResponseConfig | None = ResponseConfig()
 
     @model_validator(mode="after")

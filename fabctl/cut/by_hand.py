@@ -12,12 +12,11 @@ from fabctl.cut.execute import CutWatch, check_on_board, no_keys
 from fabctl.cut.job import identity_of, laser_config
 from fabctl.cut.place import lay, placement, travel_box_mm
 from fabctl.cut.plan import CutPlan, head_mm, program_times
+from fabctl.cut.preflight import BOX_MM
 from fabctl.cut.program import read_program, split_long
 from fabctl.cut.progress import Track
 from fabctl.errors import RefusedError
 from fabctl.events import Emit
-
-BOX_MM = 0.002
 
 
 def run_here(laser: Laser, bench: Bench, lines: Sequence[str], power_frac: float, emit: Emit) -> float:
@@ -39,8 +38,8 @@ def run_here(laser: Laser, bench: Bench, lines: Sequence[str], power_frac: float
         found.append(Finding("CUT-LASER-MODE", "the board is not in laser mode ($32=0)", hint="$32=1"))
     bounds, box = plan.bounds_mm(), travel_box_mm(identity, config.travel_mm)
     if bounds is not None and identity.is_on(22):
-        outside = (bounds[0] < box[0], bounds[1] < box[1], bounds[2] > box[2] + BOX_MM, bounds[3] > box[3] + BOX_MM)
-        if any(outside):
+        low, high = zip(bounds[:2], box[:2], strict=True), zip(bounds[2:], box[2:], strict=True)
+        if any(a < b - BOX_MM for a, b in low) or any(a > b + BOX_MM for a, b in high):
             found.append(Finding("CUT-TRAVEL", f"it would leave the travel: {bounds} in {box} mm", hint="jog first"))
     if errors(found):
         raise RefusedError("this cannot run here", errors(found))

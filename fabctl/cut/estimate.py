@@ -16,28 +16,35 @@ STRAIGHT = 0.999999
 DWELL_STEP_S = 0.050  # the board pauses in steps of this length
 SYNC_S = 0.004  # answering a line that waits for standstill and starting again
 SLOWEST_MM_S = 1.0 / 60
+STEPPERS_STAY_ON = 255
 BITS_PER_BYTE = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Dynamics:
-    """What of the board decides the time: `$110/$111`, `$120/$121`, `$11`, planner blocks, steps per mm."""
+    """What of the board decides the time: `$110/$111`, `$120/$121`, `$11`, planner blocks, steps per mm.
+
+    `lock_s` is how long GRBL stands still for its steppers to settle, whenever its queue has run out (`$1`).
+    """
 
     rate_mm_s: tuple[float, float]
     acceleration_mm_s2: tuple[float, float]
     deviation_mm: float
     planner_count: int = 15
     steps_per_mm: tuple[float, float] = (250.0, 250.0)
+    lock_s: float = 0.0
 
     @classmethod
-    def of(cls, settings: dict[int, float], planner_count: int = 15) -> Dynamics:
+    def of(cls, settings: dict[int, float], planner_count: int = 15, firmware: str = "grbl") -> Dynamics:
         """Return the dynamics that `$$` describes."""
+        lock_ms = settings.get(1, 25.0) if firmware == "grbl" else 0.0  # the others do not wait for it
         return cls(
             rate_mm_s=(settings.get(110, 500.0) / 60, settings.get(111, 500.0) / 60),
             acceleration_mm_s2=(settings.get(120, 10.0), settings.get(121, 10.0)),
             deviation_mm=settings.get(11, 0.01),
             planner_count=planner_count,
             steps_per_mm=(settings.get(100, 250.0), settings.get(101, 250.0)),
+            lock_s=0.0 if lock_ms == STEPPERS_STAY_ON else lock_ms / 1000,
         )
 
 
@@ -114,11 +121,11 @@ def _corner_sq(before: tuple[float, float], after: tuple[float, float], dynamics
 
 def _run(chain: list[_Block], dynamics: Dynamics, clock_s: float, ends: list[float]) -> float:
     """Set the end of every step of a chain that starts and ends at rest; return when it is over."""
-    entries = _entry_speeds_sq(chain, dynamics.planner_count)
+    entries = _entry_speeds_sq(chain, max(dynamics.planner_count - 1, 1))  # one of them is being made
     for block, entry_sq, exit_sq in zip(chain, entries[:-1], entries[1:], strict=True) if chain else ():
         clock_s += _time_s(block, entry_sq, exit_sq)
         ends[block.step] = clock_s
-    return clock_s
+    return clock_s + (dynamics.lock_s if chain else 0.0)
 
 
 def _entry_speeds_sq(chain: list[_Block], window: int) -> list[float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import sys
 import termios
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator
 from drivers.grbl.run import Wish
 
 KEYS: dict[str, Wish] = {" ": "hold", "h": "hold", "!": "hold", "r": "resume", "~": "resume", "s": "stop", "q": "stop"}
+STRONGEST_FIRST: tuple[Wish, ...] = ("stop", "hold", "resume")
 HELP = "keys: space hold, r resume, s stop (Ctrl-C stops too)"
 
 
@@ -25,11 +27,14 @@ def keyboard() -> Iterator[Callable[[], Wish]]:
     before = termios.tcgetattr(handle)
     tty.setcbreak(handle)
     try:
-        yield _pressed
+        yield lambda: _pressed(handle)
     finally:
         termios.tcsetattr(handle, termios.TCSADRAIN, before)
 
 
-def _pressed() -> Wish:
-    ready, _, _ = select.select([sys.stdin], [], [], 0)
-    return KEYS.get(sys.stdin.read(1).lower(), "") if ready else ""
+def _pressed(handle: int) -> Wish:
+    """Return the strongest wish among all keys pressed since: to stop, to hold, to go on."""
+    ready, _, _ = select.select([handle], [], [], 0)
+    keys = os.read(handle, 1024).decode("latin-1").lower() if ready else ""  # all of them: none may wait in a buffer
+    wishes = {KEYS.get(key, "") for key in keys}
+    return next((wish for wish in STRONGEST_FIRST if wish in wishes), "")

@@ -107,7 +107,7 @@ def with_lit_ends(
 
 def program_times(program: Program, identity: Identity) -> Estimate:
     """Return when each step of `program` ends on this board."""
-    dynamics = Dynamics.of(identity.settings, identity.planner_count)
+    dynamics = Dynamics.of(identity.settings, identity.planner_count, identity.firmware)
     return estimate(program.steps, dynamics, sum(len(line) + 1 for line in program.lines))
 
 

@@ -13,7 +13,7 @@ from fabctl.config.material import MaterialConfig
 from fabctl.cut.place import travel_box_mm
 from fabctl.cut.program import Program
 
-BOX_MM = 0.002  # half a step of a usual machine
+BOX_MM = 0.0005  # half of the last decimal that a program has: soft limits are as strict
 THICKNESS_RATIO = 0.02
 
 
@@ -50,11 +50,11 @@ def preflight(
 
 def _material(material: MaterialConfig, sheet: Sheet | None) -> list[Finding]:
     found = []
-    if material.never_cut_because is not None:
+    if material.danger is not None:
         found.append(
             Finding(
                 "CUT-MATERIAL-DANGER",
-                f"{material.name} must not be cut: {material.never_cut_because}",
+                f"{material.name} must not be cut: {material.danger}",
                 hint="take another material",
             )
         )
@@ -75,6 +75,9 @@ def _material(material: MaterialConfig, sheet: Sheet | None) -> list[Finding]:
                     "CUT-SHEET",
                     f"the design is for {sheet.thickness_mm:g} mm, {material.name} is {material.thickness_mm:g} mm",
                     hint="build the design for this sheet",
+                    value=material.thickness_mm,
+                    unit="mm",
+                    limit=sheet.thickness_mm,
                 )
             )
     return found
@@ -107,6 +110,9 @@ def _bounds(
                     f"the job needs {axis} {low:.3f} to {high:.3f} mm, the machine has {floor:g} to "
                     f"{ceiling:g} mm (all moves, lead-ins and the id included)",
                     hint="move the origin, or make the design smaller",
+                    value=(low, high),
+                    unit="mm",
+                    limit=(floor, ceiling),
                 )
             )
     return found
@@ -120,7 +126,14 @@ def _words(program: Program, identity: Identity, laser: LaserConfig, material: M
         found.append(Finding("CUT-S", "the board does not tell its full power ($30)", "warning"))
     elif most > full:
         found.append(
-            Finding("CUT-S", f"S{most:g} is more than the board's full power $30={full:g}", hint="build for this $30")
+            Finding(
+                "CUT-S",
+                f"S{most:g} is more than the board's full power $30={full:g}",
+                hint="build for this $30",
+                value=most,
+                unit="S",
+                limit=full,
+            )
         )
     least = identity.setting(31) or 0.0
     if least > 0:
@@ -136,6 +149,9 @@ def _words(program: Program, identity: Identity, laser: LaserConfig, material: M
                 f"the job asks for F{fastest:g}, the machine's axes allow {min(rates):g} mm/min: the cut "
                 "would get more energy than the preset says",
                 hint="lower the feed of the preset",
+                value=fastest,
+                unit="mm/min",
+                limit=min(rates),
             )
         )
     if any(step.beam == 3 and step.s_count > 0 for step in program.steps) and not laser.allow_m3:

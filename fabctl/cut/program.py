@@ -125,7 +125,7 @@ def _read_line(
     values = {letter: float(number) for letter, number in words if letter not in "GM"}
     before = now
     now = replace(now, feed_mm_min=values.get("F", now.feed_mm_min), s_count=values.get("S", now.s_count))
-    dwell_s, sync = 0.0, "S" in values and not {"X", "Y"} & set(values) and before.beam != 5
+    dwell_s, sync = 0.0, now.s_count != before.s_count and not {"X", "Y"} & set(values) and before.beam != 5
     for letter, number in words:
         if letter == "G":
             name = "G" + number
@@ -136,8 +136,8 @@ def _read_line(
             elif name not in MODAL_G:
                 findings.append(_finding("CUT-FORBIDDEN", index, f"{name} has no place in a laser job", _why(name)))
         elif letter == "M":
-            now = _m_word(index, "M" + str(int(float(number))), now, findings)
-            sync = True
+            switched = _m_word(index, "M" + str(int(float(number))), now, findings)
+            sync, now = sync or switched != now, switched  # a word that changes nothing waits for nothing
     if {"X", "Y"} & set(values) and dwell_s == 0.0:
         return _move(index, values, now, sync, steps, arc_tolerance_mm, findings)
     if sync or dwell_s:

@@ -20,6 +20,7 @@ from fabctl.vision.template import (
     Fit,
     correlation,
     fit,
+    fitting_blur_px,
     homography,
     look,
     module_px,
@@ -33,12 +34,20 @@ Family = Literal["5x5_250", "mip_36h12"]
 FAMILIES: dict[Family, str] = {"5x5_250": "DICT_5X5_250", "mip_36h12": "DICT_ARUCO_MIP_36h12"}
 ACCEPT_RATIO = 0.80  # correlation of the whole picture, frame and margin included
 MARGIN_RATIO = 0.06  # by how much the best code must beat the second
-CODE_RATIO = 0.55  # correlation of the code's modules alone, where frame and margin no longer help
+CODE_RATIO = 0.70  # correlation of the code's modules alone, where frame and margin no longer help
+SCREEN_CODE_RATIO = 0.55  # correlation of the whole picture, before anything is fitted
 WRONG_MODULE = 0.6  # of what a module of the other colour would show; one such makes it another marker
 HOPELESS_RATIO = 0.6  # no change of blur brings a first fit below this to ACCEPT_RATIO
+# What a quick first fit must show at least. Of markers at the limits of what is read the worst showed 0.95, 0.89, 0.12
+# and 0.34: the whole, the code alone, its lead over other codes, the worst module.
+SKETCH_RATIO, SKETCH_CODE_RATIO, SKETCH_LEAD_RATIO, SKETCH_WRONG_MODULE = 0.65, 0.5, -0.05, 1.5
+SKETCH_STEPS = 8
+ENOUGH_SIDE_PX = 1600  # a picture still larger is halved once more
+SAME_QUAD_RATIO = 0.02  # of the side: nearer outlines are one and the same
 SCREEN_RATIO = 0.45  # correlation with the bare frame that a quadrilateral needs to be looked at further
 BLURS_px = (0.5, 0.9, 1.4, 2.0, 3.0)
 COARSE_PER_MODULE = 3
+LIKELY_COUNT = 24  # codes that are compared at every blur
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,20 +99,46 @@ def find_markers(
     `upscale` enlarges the picture for the search alone, for markers of few pixels; `inverted` also takes light markers
     on dark ground; `smallest_px` is the least side of a marker.
     """
+    best: dict[int, Marker] = {}
+    for marker in find_all(image, family, upscale=upscale, inverted=inverted, smallest_px=smallest_px):
+        if marker.id not in best or best[marker.id].score_ratio < marker.score_ratio:
+            best[marker.id] = marker
+    return [best[k] for k in sorted(best)]
+
+
+def find_all(
+    image: NDArray[np.uint8],
+    family: Family = "5x5_250",
+    *,
+    upscale: int = 1,
+    inverted: bool = False,
+    smallest_px: float = 20.0,
+) -> list[Marker]:
+    """Return every marker in the picture, by id; an id that lies at two places comes twice. As `find_markers`."""
     grey = np.ascontiguousarray(image, dtype=np.float64)
-    found: dict[int, Marker] = {}
+    found: list[Marker] = []
+    refused: list[F64] = []
     for quad in _quadrilaterals(image, family, upscale, inverted, smallest_px):
-        if any(_same_place(quad, marker) for marker in found.values()):
+        if any(_same_place(quad, marker) for marker in found) or _among(quad, refused):
             continue  # OpenCV proposes the same outline once for each of its thresholds
         marker = read_quadrilateral(grey, quad, family, inverted)
-        if marker and (marker.id not in found or found[marker.id].score_ratio < marker.score_ratio):
-            found[marker.id] = marker
-    return [found[k] for k in sorted(found)]
+        if marker is None:
+            refused.append(quad)
+        elif not any(_same_place(marker.corners_px, other) for other in found):
+            found.append(marker)
+    return sorted(found, key=lambda marker: marker.id)
 
 
 def _same_place(quad: F64, marker: Marker) -> bool:
     side = float(np.linalg.norm(marker.corners_px[1] - marker.corners_px[0]))
     return bool(np.abs(quad.mean(axis=0) - marker.centre_px).max() < 0.15 * side)
+
+
+def _among(quad: F64, refused: list[F64]) -> bool:
+    if not refused:
+        return False
+    side = float(np.linalg.norm(quad[1] - quad[0]))
+    return bool((np.abs(np.array(refused) - quad).max(axis=(1, 2)) < SAME_QUAD_RATIO * side).any())
 
 
 def mirrored(image: NDArray[np.uint8], family: Family = "5x5_250") -> list[Marker]:
@@ -122,17 +157,31 @@ def read_quadrilateral(grey: F64, quad: F64, family: Family, inverted: bool = Fa
     frame = abs(correlation(seen[_frame_mask(modules)], _frame(modules)))
     if not frame >= SCREEN_RATIO:
         return None
-    seen = seen - seen.mean()
-    seen /= max(float(np.linalg.norm(seen)), 1e-9)
-    best: tuple[float, int, float] | None = None
-    for blur_px in BLURS_px:
-        scores = _templates(family, _level(blur_px / size_px)) @ seen
-        k = int(np.argmax(np.abs(scores) if inverted else scores))
-        if best is None or abs(scores[k]) > best[0]:
-            best = (abs(float(scores[k])), k, blur_px)
-    if best is None or best[0] < CODE_RATIO:
+    best = _likeliest(_unit(seen), family, size_px, inverted)
+    if best[0] < SCREEN_CODE_RATIO:
         return None
     return _refined(grey, H, family, best[1], best[2], inverted)
+
+
+def _likeliest(seen: F64, family: Family, size_px: float, inverted: bool) -> tuple[float, int, float]:
+    """Return correlation, code (id and quarter turns) and blur that fit the samples `seen` (n,) best.
+
+    All codes are compared at one blur, the likeliest of those at the others: blur changes how well a code fits, hardly
+    which.
+    """
+    blurs = list({_level(blur_px / size_px): blur_px for blur_px in reversed(BLURS_px)}.items())
+    middle = blurs.pop(len(blurs) // 2)
+    near = seen.astype(np.float32)
+    scores = _templates(family, middle[0]) @ near
+    sizes = np.abs(scores) if inverted else scores
+    chosen = np.argpartition(sizes, -LIKELY_COUNT)[-LIKELY_COUNT:]
+    best = (abs(float(scores[chosen[-1]])), int(chosen[-1]), middle[1])
+    for level, blur_px in (middle, *blurs):
+        scores = _templates(family, level)[chosen] @ near
+        k = int(np.argmax(np.abs(scores) if inverted else scores))
+        if abs(scores[k]) > best[0]:
+            best = (abs(float(scores[k])), int(chosen[k]), blur_px)
+    return best
 
 
 def _refined(grey: F64, H: F64, family: Family, k: int, blur_px: float, inverted: bool) -> Marker | None:
@@ -140,7 +189,10 @@ def _refined(grey: F64, H: F64, family: Family, k: int, blur_px: float, inverted
     number, turns = divmod(k, 4)
     turned = H @ _quarter_turns(turns)
     bits = codes(family)[number]
-    found = _best_blur(grey, bits, turned / turned[2, 2], blur_px)
+    sketch = fit(grey, bits, turned / turned[2, 2], blur_px, SKETCH_STEPS, COARSE_PER_MODULE)
+    if sketch is None or not _may_be(grey, sketch, family, number):
+        return None
+    found = _best_blur(grey, bits, sketch.H, blur_px)
     if found is None or found.score_ratio < (-1 if inverted else ACCEPT_RATIO) or abs(found.score_ratio) < ACCEPT_RATIO:
         return None
     if not _stands_out(grey, found, family, number) or worst_module(grey, bits, found) > WRONG_MODULE:
@@ -150,32 +202,42 @@ def _refined(grey: F64, H: F64, family: Family, k: int, blur_px: float, inverted
 
 
 def _best_blur(grey: F64, bits: F64, H: F64, blur_px: float) -> Fit | None:
-    best = fit(grey, bits, H, blur_px)
+    """Fit place and blur in turn: neither moves the other much."""
+    best = fit(grey, bits, H, fitting_blur_px(grey, bits, H, blur_px))
     if best is None or abs(best.score_ratio) < HOPELESS_RATIO:
         return None
-    for direction in (0.7, 1.4):
-        trial = blur_px
-        while True:
-            trial *= direction
-            other = fit(grey, bits, best.H, trial, steps=4)
-            if other is None or other.score_ratio <= best.score_ratio + 1e-4 or not 0.1 < trial < 20:
-                break
-            best = other
-    return fit(grey, bits, best.H, best.blur_px)
+    blur_px = fitting_blur_px(grey, bits, best.H, best.blur_px)
+    return best if blur_px == best.blur_px else fit(grey, bits, best.H, blur_px) or best
+
+
+def _may_be(grey: F64, sketch: Fit, family: Family, number: int) -> bool:
+    """Say whether a quick first fit is worth the full one; nearly all that is no marker ends here."""
+    if abs(sketch.score_ratio) < SKETCH_RATIO:
+        return False
+    own, lead = _code_scores(grey, sketch, family, number)
+    if own < SKETCH_CODE_RATIO or lead < SKETCH_LEAD_RATIO:
+        return False
+    return worst_module(grey, codes(family)[number], sketch) <= SKETCH_WRONG_MODULE
 
 
 def _stands_out(grey: F64, found: Fit, family: Family, number: int) -> bool:
     """Say whether the code's own modules fit, and no other id fits nearly as well."""
+    own, lead = _code_scores(grey, found, family, number)
+    return own >= CODE_RATIO and lead >= MARGIN_RATIO
+
+
+def _code_scores(grey: F64, found: Fit, family: Family, number: int) -> tuple[float, float]:
+    """Return the correlation of the code's own modules, and by how much it beats that of any other id."""
     modules = codes(family).shape[1]
     places = sample_grid(modules, COARSE_PER_MODULE)
     grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
-    seen = look(grey, warp(found.H, grid))
     level = _level(found.blur_px / math.sqrt(math.prod(module_px(found.H, modules))))
     inner = np.abs(grid).max(axis=1) < 1 - 2 / modules
-    scores = np.abs(_inner_templates(family, level) @ _unit(seen[inner]))
-    own = float(scores.reshape(-1, 4)[number].max())
-    others = np.delete(scores.reshape(-1, 4), number, axis=0).max()
-    return own >= CODE_RATIO and own >= float(others) + MARGIN_RATIO
+    seen = look(grey, warp(found.H, grid[inner]))
+    scores = np.abs(_inner_templates(family, level) @ _unit(seen)).reshape(-1, 4).max(axis=1)
+    own = float(scores[number])
+    scores[number] = -1.0
+    return own, own - float(scores.max())
 
 
 def _unit(values: F64) -> F64:
@@ -198,8 +260,8 @@ def _pictures(family: Family, sigma_modules: float) -> F64:
 
 
 @functools.cache
-def _templates(family: Family, sigma_modules: float) -> F64:
-    return np.apply_along_axis(_unit, 1, _pictures(family, sigma_modules))
+def _templates(family: Family, sigma_modules: float) -> NDArray[np.float32]:
+    return np.apply_along_axis(_unit, 1, _pictures(family, sigma_modules)).astype(np.float32)
 
 
 @functools.cache
@@ -235,15 +297,20 @@ def _quadrilaterals(
 ) -> list[F64]:
     """Return what OpenCV takes for outlines of markers, accepted or not, in pixels of the picture itself.
 
-    The half-sized picture is searched as well: in it grain and noise no longer fray the outline of a pale marker.
+    The half-sized picture is searched as well: in it grain and noise no longer fray the outline of a pale marker. A
+    large picture is halved further: a module wider than OpenCV's windows has no outline for it.
     """
     import cv2
 
     found = []
-    for scale, interpolation in ((float(upscale), cv2.INTER_CUBIC), (0.5, cv2.INTER_AREA)):
+    scales = [float(upscale), 0.5]
+    while max(image.shape) * scales[-1] > ENOUGH_SIDE_PX:
+        scales.append(scales[-1] / 2)
+    for scale in scales:
         if min(image.shape) * scale < smallest_px:
             continue
-        sized = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation)
+        how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+        sized = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how)
         found += [
             (quad + 0.5) / scale - 0.5
             for quad in _outlines(np.ascontiguousarray(sized, dtype=np.uint8), family, inverted, smallest_px)

@@ -11,6 +11,7 @@ whole numbers.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -22,6 +23,9 @@ from scipy.special import ndtr
 F64 = NDArray[np.float64]
 MARGIN_MODULES = 1.0  # how much of the white margin takes part
 PIXEL_SIGMA_PX = 0.29  # a square pixel blurs like a Gaussian of 1/sqrt(12)
+FARTHEST_PX = 1e6
+BLUR_STEP_RATIO = 1.15
+LEAST_BLUR_PX, MOST_BLUR_PX = 0.1, 20.0
 HUBER = 1.5  # residuals beyond this many standard deviations (dust, glare) count less
 
 
@@ -94,42 +98,85 @@ def look(image: F64, points_px: F64) -> F64:
     return np.asarray(map_coordinates(image, points_px[:, ::-1].T, order=1, mode="nearest"), dtype=np.float64)
 
 
-def fit(image: F64, bits: F64, H: F64, blur_px: float, steps: int = 12) -> Fit | None:
+def fit(image: F64, bits: F64, H: F64, blur_px: float, steps: int = 12, per_module: int | None = None) -> Fit | None:
     """Move `H` until the blurred marker matches the picture best; None where it runs away or the picture is flat.
 
     Unknown besides the eight of the homography: black, white, and a linear change of light over the marker.
+    `per_module` is how many samples a module takes along each axis; None lets its size in the picture decide.
     """
     modules = len(bits)
     px = module_px(H, modules)
     if not min(px) > 0.5:
         return None
-    per_module = int(np.clip(math.ceil(max(px)), 3, 6))
-    places = sample_grid(modules, per_module)
+    places = sample_grid(modules, per_module or int(np.clip(math.ceil(max(px)), 3, 6)))
     grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
     sigma_px = math.hypot(blur_px, PIXEL_SIGMA_PX)
     model = render(bits, places, (sigma_px / px[0], sigma_px / px[1])).ravel()
     fixed = np.column_stack([np.ones(len(grid)), model, grid])
-    origin, patch, slope_x, slope_y = _patch(image, H, modules)
-    if patch.size == 0:
+    origin, planes = _patch(image, H, modules)
+    if planes.size == 0:
         return None
+    moved = _moved(planes, H, origin, grid, fixed, steps, 2.5 * max(px))
+    return None if moved is None else _judge(moved, planes[:, :, 0], origin, grid, model, fixed, blur_px)
+
+
+def fitting_blur_px(image: F64, bits: F64, H: F64, start_px: float) -> float:
+    """Return the blur, to a step of `BLUR_STEP_RATIO`, with which the marker at `H` leaves the least unexplained."""
+    modules, px = len(bits), module_px(H, len(bits))
+    places = sample_grid(modules, int(np.clip(math.ceil(max(px)), 3, 6)))
+    grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
+    light = np.linalg.qr(np.column_stack([np.ones(len(grid)), grid]))[0]
+    grey = _without(light, look(image, warp(H, grid)))
+
+    @functools.cache
+    def explained(k: int) -> float:
+        sigma_px = math.hypot(start_px * BLUR_STEP_RATIO**k, PIXEL_SIGMA_PX)
+        model = _without(light, render(bits, places, (sigma_px / px[0], sigma_px / px[1])).ravel())
+        return float(grey @ model) ** 2 / max(float(model @ model), 1e-12)
+
+    best = 0
+    for step in (-1, 1):
+        while (
+            explained(best + step) > explained(best) and LEAST_BLUR_PX < start_px * BLUR_STEP_RATIO**best < MOST_BLUR_PX
+        ):
+            best += step
+    return start_px * BLUR_STEP_RATIO**best
+
+
+def _without(level: F64, values: F64) -> F64:
+    """Return `values` (n,) less what the orthonormal columns `level` (n, m) explain."""
+    return np.asarray(values - level @ (level.T @ values), dtype=np.float64)
+
+
+def _moved(planes: F64, H: F64, origin: F64, grid: F64, fixed: F64, steps: int, most_px: float) -> F64 | None:
+    """Return `H` after Gauss-Newton; `fixed` (n, 4) are the columns of light. None where it moves over `most_px`."""
+    ground = np.vstack([grid.T, np.ones(len(grid))])
+    rows = np.empty((12, len(grid)))
+    rows[8:] = -fixed.T
+    level = np.linalg.qr(fixed)[0]
     moved_px = 0.0
     for _ in range(steps):
-        at = warp(H, grid) - origin
-        grey = look(patch, at)
-        J = np.column_stack([_steering(H, grid, look(slope_x, at), look(slope_y, at)), -fixed])
-        plain = grey - fixed @ _solve(fixed, grey)
-        spread = max(1.4826 * float(np.median(np.abs(plain))), 1e-6)
-        weight = np.sqrt(np.minimum(1.0, HUBER * spread / np.maximum(np.abs(plain), 1e-9)))
-        step = _solve(J * weight[:, None], -grey * weight)
+        grey = _steer(rows[:8], planes, H, origin, ground)
+        weight = _trust(_without(level, grey))
+        step = _solve_normal(rows * weight, -grey * weight)
+        if step is None:
+            return None
         before = warp(H, CORNERS)
         H = H + np.append(step[:8], 0.0).reshape(3, 3)
         change = float(np.abs(warp(H, CORNERS) - before).max())
         moved_px += change
-        if not np.isfinite(change) or moved_px > 2.5 * max(px):
+        if not np.isfinite(change) or moved_px > most_px:
             return None
         if change < 2e-3:
             break
-    return _judge(H, patch, origin, grid, model, fixed, blur_px)
+    return H
+
+
+def _trust(plain: F64) -> F64:
+    """Return the square roots of Huber's weights of residuals (n,)."""
+    size = np.abs(plain)
+    spread = max(1.4826 * float(np.partition(size, len(size) // 2)[len(size) // 2]), 1e-6)
+    return np.asarray(np.sqrt(np.minimum(1.0, HUBER * spread / np.maximum(size, 1e-9))), dtype=np.float64)
 
 
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -140,27 +187,54 @@ def _solve(rows: F64, right: F64) -> F64:
     return np.asarray(np.linalg.lstsq(rows.T @ rows, rows.T @ right, rcond=None)[0], dtype=np.float64)
 
 
-def _patch(image: F64, H: F64, modules: int) -> tuple[F64, F64, F64, F64]:
+def _solve_normal(rows: F64, right: F64) -> F64 | None:
+    """Return the least squares of `rows` (unknowns, n), each unknown scaled to one; None where they do not suffice."""
+    normal = rows @ rows.T
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    try:
+        return np.asarray(np.linalg.solve(normal / np.outer(scale, scale), rows @ right / scale) / scale)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _patch(image: F64, H: F64, modules: int) -> tuple[F64, F64]:
+    """Return the corner (2,) of the surroundings, and (h, w, 3): grey there, its slope along x, its slope along y."""
     reach = warp(H, CORNERS * (1 + 6 / modules))
+    if not np.abs(reach).max() < FARTHEST_PX:  # a horizon runs through it
+        return np.zeros(2), np.empty((0, 0, 3))
     low = np.maximum(np.floor(reach.min(axis=0)).astype(int) - 2, 0)
     high = np.minimum(np.ceil(reach.max(axis=0)).astype(int) + 3, np.array(image.shape[::-1]))
     if np.any(high - low < 4):
-        return np.zeros(2), np.empty((0, 0)), np.empty((0, 0)), np.empty((0, 0))
+        return np.zeros(2), np.empty((0, 0, 3))
     patch = image[low[1] : high[1], low[0] : high[0]].astype(np.float64)
-    slopes = np.gradient(patch)
-    return low.astype(np.float64), patch, np.asarray(slopes[1]), np.asarray(slopes[0])
+    slope_y, slope_x = np.gradient(patch)
+    return low.astype(np.float64), np.stack([patch, slope_x, slope_y], axis=-1)
 
 
-def _steering(H: F64, grid: F64, slope_x: F64, slope_y: F64) -> F64:
-    """Return (n, 8): how each grey value changes with the first eight entries of `H`."""
-    w = np.column_stack([grid, np.ones(len(grid))])
-    mapped = w @ H.T
-    scale = 1 / mapped[:, 2]
-    x, y = mapped[:, 0] * scale, mapped[:, 1] * scale
-    along = slope_x * x + slope_y * y
-    return np.column_stack(
-        [w * (slope_x * scale)[:, None], w * (slope_y * scale)[:, None], -grid * (along * scale)[:, None]]
-    )
+def _steer(rows: F64, planes: F64, H: F64, origin: F64, ground: F64) -> F64:
+    """Return the grey values (n,) at the places `ground` (3, n); write into `rows` (8, n) how each changes with `H`."""
+    mapped = H @ ground
+    scale = 1 / mapped[2]
+    x, y = mapped[0] * scale, mapped[1] * scale
+    grey, slope_x, slope_y = _look_deep(planes, x - origin[0], y - origin[1]).T
+    np.multiply(ground, slope_x * scale, out=rows[:3])
+    np.multiply(ground, slope_y * scale, out=rows[3:6])
+    np.multiply(ground[:2], -(slope_x * x + slope_y * y) * scale, out=rows[6:])
+    return np.asarray(grey, dtype=np.float64)
+
+
+def _look_deep(planes: F64, x: F64, y: F64) -> F64:
+    """Return (n, 3): all planes at places, linear between pixels; the border repeats."""
+    h, w, depth = planes.shape
+    x, y = np.fmin(np.fmax(x, 0.0), w - 1.0), np.fmin(np.fmax(y, 0.0), h - 1.0)  # also where the place is no number
+    i, j = np.minimum(x.astype(np.intp), w - 2), np.minimum(y.astype(np.intp), h - 2)
+    fx, fy = (x - i)[:, None], (y - j)[:, None]
+    flat, at = planes.reshape(h * w, depth), j * w + i
+    upper, lower = flat[at], flat[at + w]
+    upper += (flat[at + 1] - upper) * fx
+    lower += (flat[at + w + 1] - lower) * fx
+    upper += (lower - upper) * fy
+    return np.asarray(upper, dtype=np.float64)
 
 
 def _judge(H: F64, patch: F64, origin: F64, grid: F64, model: F64, fixed: F64, blur_px: float) -> Fit | None:

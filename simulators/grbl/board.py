@@ -118,6 +118,9 @@ class Board:
     def _run(self) -> None:
         """Let the program go on until it waits; it stalls while its transmit buffer is full."""
         m = self.machine
+        if m.stalled_until_s > m.now_s + TICK_S:
+            self._wake_s = m.stalled_until_s
+            return
         if (
             self._byte_s
             and self._out_free_s - m.now_s > TX_BYTES * self._byte_s + TICK_S
@@ -147,6 +150,7 @@ class Board:
         m = self.machine
         if byte == RESET:
             m.kill()
+            self._go_deaf(m.stalled_until_s)
             self._note_beam()
         elif byte in REAL_TIME:
             m.asked |= REAL_TIME[byte]
@@ -155,7 +159,7 @@ class Board:
         elif byte in ACCESSORY_OVERRIDES:
             m.accessory_override.append(byte)
         elif byte == 0x85:
-            m.asked |= Asked.HOLD if m.state.value == "Jog" else Asked.NOTHING
+            m.asked |= Asked.MOTION_CANCEL if m.state is State.JOG else Asked.NOTHING
         elif byte < 0x80:
             if len(self._rx) >= self.rx_bytes:
                 self.rx_lost_count += 1
@@ -170,6 +174,7 @@ class Board:
             m.stepper.start(m.now_s)
         else:
             m.asked |= Asked.CYCLE_DONE
+            m.stall()
         if m.memory.on(21):
             m.watch_switches()
         self._note_beam()
@@ -195,4 +200,5 @@ class Board:
         return self._rx.popleft() if self._rx else None
 
     def _go_deaf(self, until_s: float) -> None:
-        self._deaf_until_s, self._deaf_count = until_s, 0
+        if until_s > self._deaf_until_s:
+            self._deaf_until_s, self._deaf_count = until_s, 0

@@ -267,6 +267,7 @@ def _probe(m: Machine, block: Block, power: float) -> Generator[float, None, boo
         m.alarm = ALARM_PROBE_MISSED
     yield from poll(m)
     m.stepper.reset(m.now_s)
+    yield m.now_s + m.lock_s()
     m.planner.reset(m.stepper.position)
     m.say(report.probe(m) + "\r\n")
     return True

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from simulators.grbl.modes import FLOOD, MIST, Block, Modes, Parser, Vector
 from simulators.grbl.settings import G28, G30, N_SYSTEMS, Memory
-from simulators.grbl.words import MM_PER_INCH, read_number
+from simulators.grbl.words import MM_PER_INCH, f32, read_number
 
 MAX_LINE_NUMBER = 10_000_000
 PLANES = {17: (0, 1, 2), 18: (2, 0, 1), 19: (1, 2, 0)}  # first, second and normal axis
@@ -226,7 +226,7 @@ def _set_feed(block: Block, words: _Words, parser: Parser) -> None:
 
 def _millimetres(words: _Words) -> list[float]:
     scale = MM_PER_INCH if words.modes.units == 20 else 1.0
-    return [words.values.get(letter, 0.0) * scale for letter in "XYZ"]
+    return [f32(words.values.get(letter, 0.0) * scale) for letter in "XYZ"]
 
 
 def _set_target(
@@ -240,7 +240,9 @@ def _set_target(
             raise Fault(NO_AXIS_WORDS)
         goal = list(parser.g92_mm)
         for k in words.axes:
-            goal[k] = parser.position_mm[k] - base[k] - xyz[k] - (parser.tool_length_mm if k == 2 else 0.0)
+            goal[k] = f32(f32(parser.position_mm[k] - base[k]) - xyz[k])
+            if k == 2:
+                goal[k] = f32(goal[k] - parser.tool_length_mm)
         block.target_mm = _vector(goal)
         return
     goal = list(xyz)
@@ -249,7 +251,7 @@ def _set_target(
         for k in words.axes:
             goal[k] = xyz[k]
             if block.action != "g53":
-                goal[k] += _shift(k, block, base, parser)
+                goal[k] = f32(goal[k] + _shift(k, block, base, parser))
     block.target_mm = _vector(goal)
     if block.action in ("g28", "g30"):
         stored = memory.offsets_mm[G28 if block.action == "g28" else G30]
@@ -266,7 +268,7 @@ def _set_target(
 def _shift(axis: int, block: Block, base: Vector, parser: Parser) -> float:
     if block.modes.distance == 91:
         return parser.position_mm[axis]
-    return base[axis] + parser.g92_mm[axis] + (parser.tool_length_mm if axis == 2 else 0.0)
+    return f32(base[axis] + parser.g92_mm[axis]) + (parser.tool_length_mm if axis == 2 else 0.0)
 
 
 def _set_system(block: Block, words: _Words, xyz: list[float], parser: Parser, memory: Memory, used: set[str]) -> None:
@@ -286,7 +288,9 @@ def _set_system(block: Block, words: _Words, xyz: list[float], parser: Parser, m
     for k in words.axes:
         data[k] = xyz[k]
         if how == 20:
-            data[k] = parser.position_mm[k] - parser.g92_mm[k] - xyz[k] - (parser.tool_length_mm if k == 2 else 0.0)
+            data[k] = f32(f32(parser.position_mm[k] - parser.g92_mm[k]) - xyz[k])
+            if k == 2:
+                data[k] = f32(data[k] - parser.tool_length_mm)
     block.second_mm = _vector(data)
 
 

@@ -12,10 +12,12 @@ from simulators.grbl.modes import Modes, Parser
 from simulators.grbl.planner import Overrides, Planner
 from simulators.grbl.settings import Memory
 from simulators.grbl.stepper import Pin, Stepper
+from simulators.grbl.words import f32
 
 Program = Generator[float, None, None]
 """A part of the firmware's program. It yields until when it sleeps, deaf; `ANY` waits for the next event."""
 ANY = math.inf
+STEPPERS_STAY_ON = 255
 
 ALARM_HARD_LIMIT, ALARM_SOFT_LIMIT, ALARM_ABORT, ALARM_PROBE_BEFORE, ALARM_PROBE_MISSED = range(1, 6)
 ALARM_HOMING_RESET, ALARM_HOMING_DOOR, ALARM_HOMING_PULL_OFF, ALARM_HOMING_NO_SWITCH = range(6, 10)
@@ -117,6 +119,7 @@ class Machine:
     shown_s_count: float = 0.0
     coolant: int = 0
     homed: bool = False
+    stalled_until_s: float = 0.0  # until then the program stands still in an interrupt's delay
     switches_seen: set[int] = field(default_factory=set)
     probe_found: bool = False
     probe_steps: tuple[int, int, int] = (0, 0, 0)
@@ -151,6 +154,15 @@ class Machine:
             return 1 / 255 if speed else 0.0
         self.shown_s_count = speed
         return (math.floor((speed - low) * 254 / (high - low)) + 1) / 255
+
+    def lock_s(self) -> float:
+        """Return how long the program waits when the steppers go idle: `$1`, none where they stay on (255)."""
+        stay_on = self.memory[1] == STEPPERS_STAY_ON and not self.alarm and self.state is not State.SLEEP
+        return 0.0 if stay_on or self.state is State.HOMING else self.memory[1] / 1000
+
+    def stall(self) -> None:
+        """Let the steppers go idle in an interrupt: the program stands still meanwhile."""
+        self.stalled_until_s = self.now_s + self.lock_s()
 
     def spindle_off(self) -> None:
         """Switch the laser pin off."""
@@ -189,6 +201,7 @@ class Machine:
             else:
                 self.alarm = ALARM_ABORT
             self.stepper.halt(self.now_s)
+            self.stall()
 
     def position_steps(self) -> tuple[int, int, int]:
         """Return where the board believes it is, in steps."""
@@ -196,7 +209,7 @@ class Machine:
 
     def position_mm(self) -> tuple[float, float, float]:
         """Return where the board believes it is."""
-        x, y, z = (s / p for s, p in zip(self.position_steps(), self.memory.axes(100), strict=True))
+        x, y, z = (f32(s / p) for s, p in zip(self.position_steps(), self.memory.axes(100), strict=True))
         return x, y, z
 
     def limits_hit(self) -> set[int]:
@@ -219,6 +232,7 @@ class Machine:
         changed, self.switches_seen = now != self.switches_seen, now
         if changed and self.state not in (State.ALARM, State.HOMING) and not self.alarm:
             self.kill()
+            self.go_deaf(self.stalled_until_s)
             self.alarm = ALARM_HARD_LIMIT
 
     def real_mm(self, axis: int) -> float:

@@ -12,7 +12,7 @@ from types import FrameType
 
 from simulators.clock import Clock
 from simulators.endpoints import PtyEndpoint, TcpEndpoint
-from simulators.faults import KINDS, Fault
+from simulators.faults import KINDS, SLOW_S, Fault
 from simulators.grbl.board import Board, Point
 from simulators.grbl.dialects import DIALECTS
 from simulators.grbl.machine import Machine, World
@@ -21,8 +21,9 @@ from simulators.grbl.settings import Memory
 LONGEST_WAIT_S = 0.02
 SHORTEST_WAIT_S = 0.0008  # nine bytes of a fast line: looking at each by itself would cost more than all the rest
 Trace = Callable[[Point], None]
-# A laser as a lab has it: 300 × 200 mm, homing at the far corner, laser mode on.
+# A laser as a lab has it: 300 × 200 mm, homing at the far corner, laser mode on, motors that never let go.
 LAB: dict[int, float] = {
+    1: 255,
     22: 1,
     20: 1,
     32: 1,
@@ -104,6 +105,9 @@ def _spoil(fault: Fault, out: bytes, now_s: float, board: Board, endpoint: PtyEn
     if fault.restart:
         fault.restart = False
         board.restart()
+    if fault.crawl:
+        fault.crawl = False
+        board.machine.stepper.linger_s = SLOW_S
     if fault.unplug:
         fault.unplug = False
         endpoint.exchange(out, 0.0)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from simulators.grbl.words import f32
+
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
 MIST, FLOOD = 1, 2  # bits of `coolant`: M7 and M8
@@ -41,8 +43,8 @@ class Parser:
 
     def offset_mm(self) -> Vector:
         """Return the work offset that is in force: machine minus work position."""
-        x, y, z = (a + b for a, b in zip(self.system_mm, self.g92_mm, strict=True))
-        return x, y, z + self.tool_length_mm
+        x, y, z = (f32(a + b) for a, b in zip(self.system_mm, self.g92_mm, strict=True))
+        return x, y, f32(z + self.tool_length_mm)
 
 
 @dataclass(slots=True)

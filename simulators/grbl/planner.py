@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from simulators.grbl.modes import Vector
 from simulators.grbl.settings import Memory
+from simulators.grbl.words import f32
 
 CAPACITY = 15
 MIN_RATE_MM_S = 1.0 / 60
@@ -84,7 +85,7 @@ class Planner:
     ) -> tuple[Move, Vector, tuple[int, int, int]] | None:
         """Return the move to `target_mm`, its direction and its goal in steps; None where it has no step to make."""
         per_mm = self.memory.axes(100)
-        goal = tuple(_round(t * p) for t, p in zip(target_mm, per_mm, strict=True))
+        goal = tuple(_round(f32(t * p)) for t, p in zip(target_mm, per_mm, strict=True))
         delta = [g - o for g, o in zip(goal, origin_steps, strict=True)]
         events = max(abs(d) for d in delta)
         if events == 0:

@@ -53,7 +53,7 @@ def _system(m: Machine) -> Program:
             _start(m)
         m.asked &= ~Asked.START
     if Asked.CYCLE_DONE in asked:
-        _cycle_done(m)
+        yield from _cycle_done(m)
         m.asked &= ~Asked.CYCLE_DONE
     _motion_overrides(m)
     _accessory_overrides(m)
@@ -74,6 +74,7 @@ def wake(m: Machine) -> None:
         m.stepper.start(m.now_s)
     elif not m.stepper.segments:
         m.asked |= Asked.CYCLE_DONE
+        m.stall()
 
 
 def _raise_alarm(m: Machine) -> Program:
@@ -145,7 +146,7 @@ def _start(m: Machine) -> None:
         m.state = State.IDLE
 
 
-def _cycle_done(m: Machine) -> None:
+def _cycle_done(m: Machine) -> Program:
     held = m.state in (State.HOLD, State.DOOR, State.SLEEP)
     if held and not m.soft_limit_hit and Suspend.JOG_CANCEL not in m.suspend:
         m.planner.replan()
@@ -156,6 +157,7 @@ def _cycle_done(m: Machine) -> None:
     if Suspend.JOG_CANCEL in m.suspend:
         m.stepper.holding = m.stepper.ended = m.stepper.update_pin = False
         m.stepper.reset(m.now_s)
+        yield m.now_s + m.lock_s()
         m.planner.reset(m.stepper.position)
         m.sync_position()
     if Suspend.AJAR in m.suspend:
@@ -267,6 +269,7 @@ def _door_or_sleep(m: Machine, mode: int, speed: float, coolant: int) -> Program
         m.say("[MSG:Sleeping]\r\n")
         m.set_spindle(5, 0.0)
         m.set_coolant(0)
+        yield m.now_s + m.lock_s()
         while not m.aborted():
             yield from _system(m)
             if not m.aborted():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from simulators.grbl.machine import BUSY, Machine, State, Suspend
 from simulators.grbl.modes import FLOOD, MIST
 from simulators.grbl.settings import N_SYSTEMS
-from simulators.grbl.words import coordinate, decimals, rate
+from simulators.grbl.words import coordinate, decimals, f32, rate
 
 HELP = "[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]"
 CHECK_LIMITS = "[MSG:Check Limits]"
@@ -76,7 +76,7 @@ def parameters(m: Machine) -> list[str]:
 
 def probe(m: Machine) -> str:
     """Return the last probing's result."""
-    x, y, z = (s / p for s, p in zip(m.probe_steps, m.memory.axes(100), strict=True))
+    x, y, z = (f32(s / p) for s, p in zip(m.probe_steps, m.memory.axes(100), strict=True))
     return f"[PRB:{_vector((x, y, z), m.memory.on(13))}:{int(m.probe_found)}]"
 
 
@@ -101,4 +101,4 @@ def _vector(values: tuple[float, float, float], inches: bool) -> str:
 
 
 def _minus(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return f32(a[0] - b[0]), f32(a[1] - b[1]), f32(a[2] - b[2])

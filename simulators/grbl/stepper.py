@@ -78,6 +78,7 @@ class Stepper:
     ended: bool = False  # no more segments until the hold or the system move is settled
     update_pin: bool = False
     speed_mm_s: float = 0.0  # of the segment prepared last
+    linger_s: float = 0.0  # so much longer takes the next segment to be run, on demand of a fault
     awake: bool = False
     segments: deque[Segment] = field(default_factory=deque)
     locked: set[int] = field(default_factory=set)  # axes that homing has stopped
@@ -302,6 +303,10 @@ class Stepper:
     def start(self, now_s: float) -> None:
         """Run the oldest segment from now on."""
         segment = self.segments[0]
+        if self.linger_s:
+            whole_s = segment.duration_s + self.linger_s
+            segment.power_frac *= segment.duration_s / whole_s  # the beam follows the speed
+            segment.duration_s, self.linger_s = whole_s, 0.0
         self._running_from_s, self.running_until_s = now_s, now_s + segment.duration_s
         self.pin.power_frac = segment.power_frac
 

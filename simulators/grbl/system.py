@@ -19,6 +19,7 @@ def program(m: Machine) -> Program:
         m.state = State.ALARM  # with homing on, the position is unknown until homed or unlocked
     while True:
         m.reinitialise()
+        yield m.now_s + m.lock_s()  # what arrives from here on is kept
         for line in m.dialect.before_banner:
             m.say(f"{line}\r\n")
         m.say(f"\r\n{m.dialect.banner}\r\n")
@@ -65,7 +66,8 @@ def _main_loop(m: Machine) -> Program:
         yield from poll(m)
         if m.aborted():
             return
-        if not (m.planner.moves and m.state is State.IDLE):
+        unread = m.rx_free() < m.dialect.rx_bytes  # it came during a hold that has just ended
+        if not unread and not (m.planner.moves and m.state is State.IDLE):
             yield float("inf")
 
 
@@ -164,6 +166,7 @@ def _home(m: Machine, line: str) -> Status:
     yield from home(m)
     if not m.aborted():
         m.state = State.IDLE
+        yield m.now_s + m.lock_s()
         yield from _startup(m)
     return OK
 
@@ -214,6 +217,6 @@ def _store(m: Machine, line: str, startup: bool) -> Status:
     status = m.memory.store(int(index), value[0])
     if status == OK and int(index) == 13:
         m.wco_count = 0
-    if status == OK and int(index) in (30, 31, 32):
+    if status == OK and int(index) in (30, 31):
         m.spindle_off()
     return status

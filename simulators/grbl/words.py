@@ -8,6 +8,7 @@ from functools import lru_cache
 
 MAX_DIGITS = 8  # further digits only shift the decimal point
 MM_PER_INCH = 25.4
+FACTORS = ((), (10.0,), (100.0,), (100.0, 10.0), (100.0, 100.0))  # to so many decimals
 
 
 def f32(value: float) -> float:
@@ -19,6 +20,7 @@ def f32(value: float) -> float:
 
 
 TENTH, HUNDREDTH = f32(0.1), f32(0.01)
+INCH_PER_MM = f32(0.0393701)
 
 
 @lru_cache(maxsize=8192)
@@ -67,7 +69,10 @@ def decimals(value: float, places: int) -> str:
     """Return `value` with `places` decimals, half rounded away from zero."""
     if not math.isfinite(value):
         return "inf"  # no job comes here; the board prints whatever its registers hold
-    count = int(abs(value) * 10**places + 0.5)
+    scaled_up = f32(abs(value))
+    for factor in FACTORS[places]:
+        scaled_up = f32(scaled_up * factor)
+    count = int(f32(scaled_up + 0.5))
     sign = "-" if value < 0 else ""
     if places == 0:
         return f"{sign}{count}"
@@ -77,9 +82,9 @@ def decimals(value: float, places: int) -> str:
 
 def coordinate(value_mm: float, inches: bool) -> str:
     """Return a length as reports show it: three decimals in mm, four in inches."""
-    return decimals(value_mm / MM_PER_INCH, 4) if inches else decimals(value_mm, 3)
+    return decimals(f32(f32(value_mm) * INCH_PER_MM), 4) if inches else decimals(value_mm, 3)
 
 
 def rate(value_mm_min: float, inches: bool) -> str:
     """Return a speed as reports show it: whole mm/min, or inches/min with one decimal."""
-    return decimals(value_mm_min / MM_PER_INCH, 1) if inches else decimals(value_mm_min, 0)
+    return decimals(f32(f32(value_mm_min) * INCH_PER_MM), 1) if inches else decimals(value_mm_min, 0)

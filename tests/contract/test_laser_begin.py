@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks._laser_jobs import JOBS, dense_job
+from benchmarks._laser_jobs import timed_jobs
 from benchmarks._laser_kills import PROGRAM, RUN_ON_S, missing_count, twice_mm
 from benchmarks._laser_rig import LAB, Rig
 from drivers.grbl.laser import Laser
@@ -16,7 +16,7 @@ from fabctl.cut.program import read_program
 from fabctl.cut.progress import Track
 from fabctl.events import silent
 
-SHORT = ("wave", "dense", "scattered")
+SHORT = ("wave", "dense", "hurried", "scattered")
 
 
 def run(laser: Laser, lines: list[str]) -> tuple[Progress, Track]:
@@ -47,7 +47,7 @@ def test_a_short_job_ends_when_the_board_stands_not_when_the_host_has_listened_o
     laser = rig.laser()
     laser.connect()
     begun_s = rig.clock.now_s()
-    progress, track = run(laser, {**JOBS, "dense": dense_job()}[name])
+    progress, track = run(laser, timed_jobs()[name])
     assert progress.time_s == pytest.approx(track.times.total_s, rel=0.01)
     assert rig.clock.now_s() - begun_s > progress.time_s + 0.2  # the host's own, in which nothing moves
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks._laser_rig import Rig, Watch, slits
+from benchmarks._laser_rig import LAB, Rig, Watch, slits
 from drivers.errors import DeviceAlarm, DeviceError, DeviceRefused, ProtocolError
 from drivers.grbl.faults import LineRefused
 from drivers.grbl.laser import Laser
@@ -69,6 +69,16 @@ def test_leaving_the_block_by_an_exception_is_dark_and_confirmed() -> None:
     assert laser.left is not None
     assert laser.left.confirmed
     assert laser.left.position_known
+
+
+def test_a_heavy_machine_found_in_motion_is_braked_to_the_end_before_the_reset() -> None:
+    rig = Rig(settings={**LAB, 120: 10})
+    rig.board.receive(b"G21G90M4S0\nG1X-200F1500S500\n")
+    rig.board.advance_to(rig.clock.now_s() + 5.0)
+    laser = connected(rig)  # braking takes two and a half seconds
+    report = laser.report()
+    assert report.state == "Idle"
+    assert report.machine_mm == pytest.approx(rig.board.machine.position_mm(), abs=0.002)
 
 
 def test_off_never_sends_a_line() -> None:
@@ -136,6 +146,25 @@ def test_a_second_interrupt_resets_at_once() -> None:
     assert left.confirmed
     assert not left.position_known
     assert rig.board.machine.pin.power_frac == 0
+
+
+@pytest.mark.parametrize("button", [b"!", b"\x84"])
+def test_a_board_paused_by_its_own_button_or_door_is_resumed_too(button: bytes) -> None:
+    rig = Rig()
+    laser = connected(rig)
+    now_s = rig.clock.now_s()
+    watch = Watch([(now_s + 2.0, "resume")], rig.clock)
+    pressed: list[float] = []
+
+    def press(_: bytes) -> None:
+        if not pressed and rig.clock.now_s() > now_s + 0.6:
+            pressed.append(rig.clock.now_s())
+            rig.board.receive(button)
+
+    rig.before_send = press
+    done = run_program(laser, slits(6), watch)
+    assert done.answered_count == len(slits(6))
+    assert {p.report.state for p in watch.reports if p.report is not None} & {"Hold", "Door"}
 
 
 def test_homing_makes_the_position_known() -> None:

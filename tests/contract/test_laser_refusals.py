@@ -9,13 +9,17 @@ from typing import Any
 import pytest
 
 from benchmarks._laser_rig import LAB, Rig
+from design.findings import errors
+from drivers.errors import DeviceAlarm
 from drivers.grbl.laser import Laser
 from fabctl.config.bench import LaserConfig
+from fabctl.config.material import LaserPreset, LayerConfig, MaterialConfig
 from fabctl.cut.by_hand import run_here
 from fabctl.cut.execute import check_on_board
 from fabctl.cut.job import recheck_offset
 from fabctl.cut.place import Affine
 from fabctl.cut.plan import CutPlan, program_times
+from fabctl.cut.preflight import preflight
 from fabctl.cut.program import read_program
 from fabctl.errors import RefusedError
 from fabctl.events import silent
@@ -25,6 +29,13 @@ HERE = ("G21", "G90", "G94", "M4S0", "G1X-5F600S{s}", "M5", "G4P0.01")
 BENCH: Any = SimpleNamespace(
     config=SimpleNamespace(name="small", laser=LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0)))
 )
+
+
+LAYER = LayerConfig(power_frac=0.5, feed_mm_s=25.0)
+RUBBER = MaterialConfig(
+    name="rubber", E_MPa=1.5, nu_ratio=0.45, thickness_mm=2.3, density_kg_m3=1150.0,
+    laser=LaserPreset(slit=LAYER, outline=LAYER, engrave=LAYER, mark=LAYER, kerf_mm=0.125, air_assist=False),
+)  # fmt: skip
 
 
 def connected(rig: Rig) -> Laser:
@@ -61,6 +72,22 @@ def test_an_offset_that_changed_since_the_plan_is_found() -> None:
     recheck_offset(laser, plan)
     laser.ask("G10L2P1X-7")
     assert refusal(lambda: recheck_offset(laser, plan)) == {"CUT-OFFSET"}
+
+
+@pytest.mark.parametrize("ends", [(-6.0, -2.0), (-6.0, 0.0), (-6.0, 0.001), (-300.0, -290.0), (-300.001, -290.0)])
+def test_what_passes_the_preflight_passes_the_board_s_own_soft_limits(ends: tuple[float, float]) -> None:
+    low, high = ends
+    lines = ("G21", "G90", "M4S0", f"G0X{low:g}Y-5F600S300", f"G1X{high:g}", "M5", "G4P0.01")
+    laser = connected(Rig())
+    assert laser.identity is not None
+    bench = LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0))
+    found = preflight(read_program(lines), laser.identity, laser.report(), bench, RUBBER, (0.0, 0.0, 0.0))
+    assert (errors(found) == []) is (low >= -300.0 and high <= 0.0)
+    if errors(found):
+        with pytest.raises(DeviceAlarm):
+            check_on_board(laser, lines)
+    else:
+        check_on_board(laser, lines)
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks._laser_dialogues import recorded_job
 from drivers.grbl.messages import Report
 from drivers.grbl.settings import Identity, Settings
 from fabctl.config.bench import LaserConfig
-from fabctl.config.material import LaserPreset, LayerConfig, MaterialConfig
+from fabctl.config.material import LaserPreset, LayerConfig, MaterialConfig, load_material
 from fabctl.cut import job
 from fabctl.cut.estimate import Dynamics, estimate
 from fabctl.cut.place import Affine, lay, read_affine, travel_box_mm
@@ -40,7 +41,8 @@ BOARD = Identity(
 LASER = LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0))
 IDLE = Report("Idle", machine_mm=(-1.0, -1.0, -1.0))
 GOOD = ("G21", "G90", "M8", "M4S0", "G0X-200Y-100F1500S500", "G1X-190", "G0X-200Y-90", "G1X-190", "M5", "M9", "G4P0.01")
-DYNAMICS = Dynamics.of(BOARD.settings)
+DYNAMICS = Dynamics.of(BOARD.settings | {1: 255.0})
+LOCKING = Dynamics.of(BOARD.settings)
 
 
 def with_settings(**changes: float) -> Identity:
@@ -198,10 +200,45 @@ def test_long_cuts_are_divided_and_stay_the_same_cut() -> None:
     assert divided.steps[-1].beam == 5
 
 
+@pytest.mark.parametrize("name", ["PVC-film", "soft vinyl", "neoprene-3", "polychloroprene", "Hypalon", "cr-60", "CSM"])
+def test_chlorine_is_known_by_its_names_too(name: str) -> None:
+    assert codes(material=RUBBER.model_copy(update={"name": name})) == {"CUT-MATERIAL-DANGER"}
+
+
+@pytest.mark.parametrize("name", ["acrylic-3", "natural-rubber-2.3", "chlorine-free foam", "latex", "EPDM", "eva-foam"])
+def test_harmless_names_are_not_taken_for_chlorine(name: str) -> None:
+    assert codes(material=RUBBER.model_copy(update={"name": name})) == set()
+
+
+@pytest.mark.parametrize("name", ["neoprene-2.0", "pvc-0.5"])
+def test_the_dangerous_materials_of_the_shelf_are_refused(name: str) -> None:
+    assert "CUT-MATERIAL-DANGER" in codes(material=load_material(name, Path("nowhere")))
+
+
 def test_a_single_move_takes_the_time_of_its_trapezoid() -> None:
     program = read_program(("G21", "G90", "M4S0", "G1X50F1500S5"))
     v, a = 25.0, 500.0
     assert estimate(program.steps[1:], DYNAMICS).total_s == pytest.approx(50 / v + v / a)
+
+
+def test_every_standstill_lasts_until_the_steppers_have_settled() -> None:
+    twice = read_program(("G1X10F1500S5", "M4S0", "M8", "G1X20", "M5", "M9"))
+    free_s, locked_s = (estimate(twice.steps, dynamics).total_s for dynamics in (DYNAMICS, LOCKING))
+    assert locked_s - free_s == pytest.approx(2 * 0.025)
+    assert Dynamics.of({1: 25.0}, firmware="FluidNC").lock_s == 0.0
+
+
+def test_words_that_change_nothing_wait_for_nothing() -> None:
+    lines = ("G1X10F1500S5", "M4S5", "M8", "G1X20S5")
+    again = (*lines[:3], "M4", "M8", "S5", "G1X20S5")
+    assert [step.sync for step in read_program(again).steps] == [step.sync for step in read_program(lines).steps]
+    louder = read_program(("M4S5", "G1X10F1500", "S6", "G1X20S7"))
+    assert [step.sync for step in louder.steps] == [True, False, True, False]
+
+
+def test_the_estimate_is_that_of_a_recorded_board(shared: Path) -> None:
+    sent, took_s = recorded_job(shared / "laser" / "grbl-1.1h-dialogues" / "motion.jsonl")
+    assert estimate(read_program(sent).steps, LOCKING).total_s == pytest.approx(took_s, rel=0.006)
 
 
 def test_a_corner_costs_time_and_a_straight_joint_none() -> None:
@@ -222,6 +259,15 @@ def test_more_steps_never_make_a_smooth_path_faster() -> None:
         return estimate(read_program(lines).steps, DYNAMICS).total_s
 
     assert circle(4000) > circle(400)  # fifteen moves of 0.03 mm leave no room to brake from full speed
+
+
+def test_no_piece_is_faster_than_the_moves_behind_it_can_brake_from() -> None:
+    count, piece_mm = 3000, 0.1
+    program = read_program([f"G1X{piece_mm * (k + 1):.4f}F6000S5" for k in range(count)])
+    took_s = estimate(program.steps, DYNAMICS).total_s
+    cruise_mm_s = math.sqrt(2 * 500 * 14 * piece_mm)  # fifteen moves, of which one is being made
+    piece_s = 2 * (math.sqrt(cruise_mm_s**2 + 500 * piece_mm) - cruise_mm_s) / 500  # in which it goes up and down again
+    assert took_s == pytest.approx(count * piece_s + cruise_mm_s / 500, rel=0.001)
 
 
 def test_a_pause_is_rounded_up_to_the_board_s_steps() -> None:

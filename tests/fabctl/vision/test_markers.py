@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from benchmarks._camera_pictures import no_marker
 from fabctl.vision.boards import REGISTRATION_IDS
 from fabctl.vision.markers import codes, find_markers, mirrored
-from fabctl.vision.template import blur_matrix, homography, render, sample_grid, warp
+from fabctl.vision.template import Fit, blur_matrix, fit, homography, render, sample_grid, warp
 
 F64 = NDArray[np.float64]
 SUPER = 6
@@ -119,6 +120,28 @@ def test_a_homography_is_found_again_from_its_points(shift: tuple[float, float],
     H = np.array([[1.2, 0.1, shift[0]], [-0.2, 0.9, shift[1]], [bend, 0.05, 1.0]])
     points = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1], [0.2, 0.3]])
     assert homography(points, warp(H, points)) == pytest.approx(H, abs=1e-8)
+
+
+def test_an_id_in_a_mirror_is_not_read_as_a_blurred_mark_of_the_other_family() -> None:
+    """With blur and place free, few modules of another code can be smeared until the whole correlates well."""
+    rng = np.random.default_rng(6)
+    picture = [no_marker(k, rng) for k in range(24)][23]
+    assert find_markers(picture) == []
+
+
+def test_what_is_no_marker_costs_one_quick_fit_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(8)
+    pictures = [no_marker(k, rng) for k in range(8)]
+    quick: list[bool] = []
+
+    def counted(image: F64, bits: F64, H: F64, blur_px: float, *rest: int) -> Fit | None:
+        quick.append(bool(rest))
+        return fit(image, bits, H, blur_px, *rest)
+
+    monkeypatch.setattr("fabctl.vision.markers.fit", counted)
+    assert all(find_markers(picture) == [] for picture in pictures)
+    assert len(quick) > 20
+    assert quick.count(False) < 0.5 * quick.count(True)
 
 
 @pytest.mark.parametrize("seed", [1, 3])
