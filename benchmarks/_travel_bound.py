@@ -30,7 +30,9 @@ def bound_mm(ends_mm: Array, tour_mm: float) -> float:
     links, length = _near_links(ends_mm)
     strokes = np.arange(n).reshape(-1, 2)
     rows, columns = np.vstack([links, strokes]).T
-    price, before, best, best_price = np.zeros(n), np.zeros(n), -np.inf, np.zeros(n)
+    price: Array = np.zeros(n)
+    before: Array = np.zeros(n)
+    best, best_price = -np.inf, price
     step_mm = tour_mm / n
     for number in range(ROUNDS_COUNT):
         weight = np.concatenate([length + price[links].sum(axis=1) + LIFT_MM, np.ones(len(strokes))])
@@ -39,11 +41,11 @@ def bound_mm(ends_mm: Array, tour_mm: float) -> float:
         loose = np.argpartition(price, 2)[:2]  # where the path begins and ends
         value = (tree.data[moves] - LIFT_MM).sum() + price[loose].sum() - price.sum()
         if value > best:
-            best, best_price = value, price.copy()
+            best, best_price = value, price
         count = np.bincount(tree.coords[0], minlength=n) + np.bincount(tree.coords[1], minlength=n)
         count[loose] += 1
-        over = count - 2.0
-        price += step_mm * (0.7 * over + 0.3 * (before if number else over))
+        over = count.astype(np.float64) - 2
+        price = price + step_mm * (0.7 * over + 0.3 * (before if number else over))
         before, step_mm = over, step_mm * SHRINK_RATIO
     return float(_tree_mm(ends_mm, best_price) + np.sort(best_price)[:2].sum() - 2 * best_price.sum())
 

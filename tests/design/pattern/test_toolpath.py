@@ -171,7 +171,7 @@ def test_no_order_travels_less_than_the_bound(seed: int) -> None:
     found = travel_mm(ends, tour(ends))
     bound = bound_mm(ends, found)
     assert floor_mm(ends) < bound <= found
-    assert bound > 0.93 * found
+    assert bound > 0.85 * found  # the floor is at 0.8
 
 
 def test_travel_is_a_quarter_shorter_than_greedy() -> None:
