@@ -46,7 +46,10 @@ def command() -> None:
     "--resume", type=RUN, metavar="RUN", help="Go on with an interrupted run, at its next whole curve or point."
 )
 @click.option("--temperature-degC", type=float, help="Room temperature, where the rig has no sensor of its own.")
-@click.option("--humidity-frac", type=float, help="Relative humidity, 0 to 1.")
+@click.option("--humidity-frac", type=click.FloatRange(0, 1), help="Relative humidity, 0 to 1.")
+@click.option("--thickness-mm", type=click.FloatRange(min=0, min_open=True), help="As measured on this specimen.")
+@click.option("--batch", help="Of the material.")
+@click.option("--rest-h", type=click.FloatRange(min=0), help="Hours since it was deployed, or last pressed.")
 @click.option("--dry-run", is_flag=True, help="Stop after the check; nothing moves.")
 @yes_option
 @json_option
@@ -57,6 +60,9 @@ def run_command(
     resume: str | None,
     temperature_degc: float | None,
     humidity_frac: float | None,
+    thickness_mm: float | None,
+    batch: str | None,
+    rest_h: float | None,
     dry_run: bool,
     yes: bool,
     as_json: bool,
@@ -71,7 +77,14 @@ def run_command(
     place = lab()
     bench_config = load_bench(bench_name, place.root)
     earlier = place.run(resume) if resume else None
-    plan = plan_test(place, place.specimen(specimen), method, bench_config, earlier)
+    facts = {
+        "temperature_degC": temperature_degc,
+        "humidity_frac": humidity_frac,
+        "thickness_mm": thickness_mm,
+        "batch": batch,
+        "rest_h": rest_h,
+    }
+    plan = plan_test(place, place.specimen(specimen), method, bench_config, earlier, facts)
     for line in _screen(plan, bench_config.name):
         say(line)
     refuse(plan)
@@ -80,16 +93,8 @@ def run_command(
         return
     if not confirm("Start?", yes):
         raise Stopped("not started")
-    facts = {"temperature_degC": temperature_degc, "humidity_frac": humidity_frac}
     with open_bench(place, bench_config, f"testing {specimen}") as bench, Keys(progress()) as keys:
-        run = run_test(
-            place,
-            plan,
-            bench,
-            keys.listen,
-            Steering(keys.wish, keys.go_on),
-            {name: value for name, value in facts.items() if value is not None},
-        )
+        run = run_test(place, plan, bench, keys.listen, Steering(keys.wish, keys.go_on))
     _render(run, as_json)
 
 
