@@ -250,11 +250,16 @@ def facts(design: Design) -> dict[str, Any]:
     if design.sheets:
         found["sheets_mm"] = [list(one.drawing.size_mm) for one in design.sheets]
     if design.predicted is not None:
-        deviation = design.predicted.deployed.deviation
+        deviation, rest = design.predicted.deployed.deviation, design.predicted.deployed.equilibrium
         found |= {
             "deviation_mean_mm": deviation.mean_mm,
             "deviation_max_mm": deviation.max_mm,
             "deviation_mean_frac": deviation.mean_frac,
+            "residual_ratio": rest.residual_ratio,
+            "iterations_count": rest.iterations_count,
+            "smallest_eigenvalue_N_mm": design.predicted.smallest_eigenvalue_N_mm,
+            "response_residual_ratio": design.predicted.response.residual_ratio,
+            "response_unstable_count": design.predicted.response.unstable_count,
             "stiffness_2mm_N_mm": design.predicted.response.stiffness_N_mm(2.0),
         }
     return found

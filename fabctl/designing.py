@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from dataclasses import replace as changed
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import yaml
@@ -19,12 +20,13 @@ from design.cells.sheet import Sheet
 from design.coupon import Coupon, coupon
 from design.export.gcode import GcodeOptions
 from design.findings import Finding
+from design.flatten.cut import chain_through
 from design.job import JobOptions, compose_job
 from design.meshfiles import read_given_flat, read_mesh
 from design.pattern.paths import Layer, LayerPreset
 from design.pattern.toolpath import ToolOptions
 from design.pipeline import Design, build
-from design.spec import DesignSpec, Kind
+from design.spec import DesignSpec, Kind, Rim
 from design.surface import TriMesh
 from design.targets import TARGETS
 from fabctl.config.bench import names
@@ -79,6 +81,10 @@ def _inputs_of(
     if config.flatten.source == "target":
         flat_mm = read_given_flat(target_file(config, beside, target), mesh)
         spec = changed(spec, flatten=changed(spec.flatten, given_mm=flat_mm))
+    if config.flatten.cut_mm is not None:
+        spec = changed(
+            spec, flatten=changed(spec.flatten, cut_path=chain_through(mesh, np.array(config.flatten.cut_mm)))
+        )
     file = library or library_file(config, beside)
     cells = library_of(config, file).scaled(sheet)
     return Inputs(spec, keeping("library", file, text), mesh, cells, presets, tuple(findings))
@@ -163,8 +169,12 @@ def build_folder(
     return design, bundle
 
 
-def build_compensated(bundle: Bundle, folder: Path, home: Path, emit: Emit = silent) -> tuple[Design, Finding]:
+def build_compensated(
+    bundle: Bundle, folder: Path, home: Path, emit: Emit = silent, rim: Literal[True] | Rim = True
+) -> tuple[Design, Finding]:
     """Build a design folder anew with compensated expansions; raise `RefusedError` where they do not help.
+
+    `rim` says on what the sheet bears its weight; True: it is free of both.
 
     The specification kept in the new folder asks for the compensation itself, so that it can be built from there.
     """
@@ -172,11 +182,11 @@ def build_compensated(bundle: Bundle, folder: Path, home: Path, emit: Emit = sil
     spec_path, target = bundle.file("spec.yaml"), bundle.file("target.ply")
     cell_mm = bundle.manifest["facts"].get("cell_mm")  # the command line may have asked for other cells than the file
     inputs = read_inputs(str(spec_path), home, target, cell_mm)
-    design = design_of(changed(inputs, spec=changed(inputs.spec, compensate=True)), emit)
+    design = design_of(changed(inputs, spec=changed(inputs.spec, compensate=rim)), emit)
     told = next((f for f in design.findings if f.code in ("COMPENSATED", "COMPENSATE-NOT")), None)
     if told is None or told.code == "COMPENSATE-NOT":
         raise RefusedError("the design was not compensated", [told] if told else [])
-    text = re.sub(r"(?m)^compensate:.*\n", "", inputs.text).rstrip("\n") + "\ncompensate: true\n"
+    text = re.sub(r"(?m)^compensate:.*\n", "", inputs.text).rstrip("\n") + f"\ncompensate: {str(rim).lower()}\n"
     write_bundle(design, text, folder)
     return design, told
 
@@ -224,8 +234,8 @@ def sheet_of(material: MaterialConfig, edge_mm: float) -> Sheet:
 
 def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
     """Return how each layer is cut; raise `RefusedError` for a material that must not, or cannot yet, be cut."""
-    if material.never_cut_because:
-        danger = Finding("MATERIAL-NEVER", material.never_cut_because, where=material.name)
+    if material.danger:
+        danger = Finding("MATERIAL-NEVER", material.danger, where=material.name)
         raise RefusedError(f"{material.name} must not be cut", [danger])
     if material.laser is None:
         missing = Finding("MATERIAL-LASER", "has no laser preset", where=material.name, hint="cut a power-speed grid")

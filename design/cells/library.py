@@ -33,8 +33,15 @@ FORMAT = 1
 SHIPPED = Path(__file__).parent / "data" / "library.npz"
 SHIPPED_OPEN = SHIPPED.with_name("library-open.npz")
 VERDICTS = ("bistable", "not bistable", "invalid", "not converged")
-SHALLOW = "too near the fold for the mesh"  # how `homogenise.numbers` ends its reason for a well below its limit
-NUMBERS = ("expansion_ratio", "saddle_ratio", "barrier_mm2", "stored_mm2", "stiffness_mm2", "nu_tangent_ratio")
+NUMBERS = (
+    "expansion_ratio",
+    "saddle_ratio",
+    "barrier_mm2",
+    "stored_mm2",
+    "stiffness_mm2",
+    "nu_tangent_ratio",
+    "mesh_ratio",
+)
 OPEN_NUMBERS = ("open_ratio", "overlap_frac")
 
 
@@ -102,17 +109,10 @@ class CellLibrary:
         words = [_general(self.meta["reasons"][int(k)]) for k in self.table["reason"][self.table["verdict"] != 0]]
         return dict(Counter(words).most_common())
 
-    def shallow_count(self) -> int:
-        """Return how many candidates have a second state too shallow for the mesh; they are counted not bistable."""
-        return len(self.shallow_cells()[0])
-
     def shallow_cells(self) -> tuple[Array, Array]:
-        """Return (t_mm, theta_rad), (n,) each, of those candidates."""
-        rows = np.isin(self.table["reason"], self._shallow_reasons())
+        """Return (t_mm, theta_rad), (n,) each, of the cells whose shallow well was decided at half the mesh size."""
+        rows = self.table.get("mesh_ratio", np.ones(len(self.table["t_mm"]))) < 1
         return self.table["t_mm"][rows], self.table["theta_rad"][rows]
-
-    def _shallow_reasons(self) -> list[int]:
-        return [k for k, reason in enumerate(self.meta["reasons"]) if reason.endswith(SHALLOW)]
 
     def at(self, t_mm: Array | float, theta_rad: Array | float) -> CellProperties:
         """Return the cells (t, θ), broadcast; NaN and `inside` False where no bistable cells surround the point."""

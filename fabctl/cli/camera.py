@@ -12,6 +12,8 @@ from fabctl.cli.common import PLACE_MM, bench_option, json_option, lab, say, sho
 from fabctl.cli.paths import RUN, InFile, InFolder, OutFile, PhotoFile, config_names
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from design.pattern.paths import CutPath
     from drivers.camera import Frame
     from fabctl.config.bench import BenchConfig
@@ -163,9 +165,9 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
     """Measure the lens from PICTURES of a ChArUco board, or from the bench's camera."""
     from fabctl.config.boards import load_board
     from fabctl.errors import UsageError
-    from fabctl.files import picture_of
     from fabctl.vision import lens
     from fabctl.vision.bed import lens_path
+    from fabctl.vision.overlay import coverage_map, write_picture
 
     config = load_board(board_name, lab().root)
     if config.kind != "charuco":
@@ -173,7 +175,9 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
     if config.measured_mm is None:
         say(f"{board_name}: not measured after printing; the lens does not mind, distances would")
     bench, state = bench_and_state(bench_name)
-    frames = [picture_of(path) for path in pictures] or _live(bench, state, views)
+    frames = _readable(pictures) if pictures else _live(bench, state, views)
+    if not frames:
+        raise UsageError(f"none of the {len(pictures)} files is a picture that can be read")
     seen = [lens.find_board(frame.image, config.charuco(), frame.source) for frame in frames]
     for _, found in seen:
         for finding in found:
@@ -183,12 +187,17 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
         raise UsageError(f"the pictures have {len(sizes)} sizes; a lens is measured at one")
     h, w = sizes.pop()
     good = [view for view, _ in seen if view is not None]
-    made = lens.calibrate(good, (w, h), config.charuco(), datetime.now(UTC).isoformat())
     path = lens_path(state, bench.camera.calibration if bench.camera else None)
+    drawn = path.with_suffix(".png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(str(drawn), coverage_map(good, (w, h)))
+    say(f"{drawn}: where in the frame the board was seen")
+    made = lens.calibrate(good, (w, h), config.charuco(), datetime.now(UTC).isoformat())
     lens.write_lens(made.lens, path, {"views": dict(zip(made.sources, made.view_rms_px, strict=True))})
     facts = made.lens
     data = {
         "lens": str(path),
+        "picture": str(drawn),
         "views_count": facts.views_count,
         "rms_px": facts.rms_px,
         "repeat_px": facts.repeat_px,
@@ -350,6 +359,20 @@ def bed_picture(bench_name: str, image: Path | None) -> Frame:
     from fabctl.files import picture_of
 
     return picture_of(image) if image is not None else snapshot(_camera_url(*bench_and_state(bench_name)))
+
+
+def _readable(pictures: Iterable[Path]) -> list[Frame]:
+    """Return the pictures that can be read; name the others."""
+    from fabctl.errors import UsageError
+    from fabctl.files import picture_of
+
+    frames = []
+    for path in pictures:
+        try:
+            frames.append(picture_of(path))
+        except UsageError as fault:
+            say(f"left out: {fault}")
+    return frames
 
 
 def _camera_url(bench: BenchConfig, state: Path) -> str:

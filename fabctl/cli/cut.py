@@ -97,6 +97,8 @@ def run(
     from fabctl.cut.keyboard import HELP, keyboard
 
     home = lab()
+    if (design / "coupon.json").is_file():
+        raise click.UsageError(f"{design} is a kerf coupon: fabctl kerf cut {design}")
     bundle, spec = open_design(design)
     chosen = load_material(material or spec.material, home.root)
     config = load_bench(bench_name, home.root)

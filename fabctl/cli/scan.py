@@ -31,6 +31,11 @@ def command() -> None:
 @click.argument("words", nargs=-1, type=SPECIMEN_OR_FILE, metavar="[SPECIMEN] [CLOUD]")
 @click.option("--target", type=InFile(), help="Target mesh, for a cloud without a specimen.")
 @click.option(
+    "--predicted",
+    type=InFile(),
+    help="Deployed shape that a model foresaw, compared as well  [the specimen's deployed.ply].",
+)
+@click.option(
     "--scale",
     type=click.Choice(["free", "known", "markers"]),
     default="free",
@@ -79,6 +84,7 @@ def command() -> None:
 def run_scan(
     words: tuple[str, ...],
     target: Path | None,
+    predicted: Path | None,
     scale: str,
     unit_mm: float,
     markers: Path | None,
@@ -111,7 +117,8 @@ def run_scan(
         raise UsageError("--bars and --model belong to --scale markers")
     if pictures is not None and model is None:
         raise UsageError(f"--pictures {pictures} belongs to --model, the scan's COLMAP text model")
-    predicted = None if specimen is None else specimen.design / "deployed.ply"
+    if predicted is None and specimen is not None and (specimen.design / "deployed.ply").is_file():
+        predicted = specimen.design / "deployed.ply"
     options: dict[str, Any] = {
         "scale": scale,
         "unit_mm": unit_mm,
@@ -129,8 +136,7 @@ def run_scan(
         "seed": seed,
     }
     if cloud is not None:
-        request = Request(cloud, mesh, predicted if predicted and predicted.is_file() else None, **options)
-        _run(here, request, specimen, as_json)
+        _run(here, Request(cloud, mesh, predicted, **options), specimen, as_json)
         return
     if specimen is None:
         raise UsageError("give the cloud's file")

@@ -11,6 +11,10 @@ from fabctl.cli.common import json_option, lab, show
 from fabctl.cli.paths import SPECIMEN, InFile
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from design.findings import Finding
     from fabctl.workspace import Specimen
 
 
@@ -72,12 +76,25 @@ def note(name: str, facts: tuple[str, ...], free: bool, as_json: bool) -> None:
     show(specimen.record(), as_json, [f"{name}: noted {', '.join(noted)}"])
 
 
+def _why_no_id(image: NDArray[np.uint8], path: Path) -> Finding:
+    """Return why the picture shows no id: a mirrored one, or none at all."""
+    from design.findings import Finding
+    from fabctl.vision.ids import read_ids
+
+    turned = read_ids(image[:, ::-1].copy())
+    if turned:
+        text = f"{turned[0].specimen} is seen in a mirror: the picture, or the specimen, is the other way round"
+        return Finding("ID-MIRRORED", text, where=str(path), hint="photograph the engraved side, without mirroring")
+    hint = "nearer (3 px a module at least), sharper, less tilted, no glare"
+    return Finding("ID-NONE", "no specimen id in the picture", where=str(path), hint=hint)
+
+
 @command.command("read")
 @click.argument("image", type=InFile())
 @json_option
 def read(image: Path, as_json: bool) -> None:
     """Read the engraved ids in a picture, and say which runs they have."""
-    from design.findings import Finding, errors
+    from design.findings import errors
     from fabctl.errors import RefusedError
     from fabctl.files import picture_of
     from fabctl.vision.ids import read_ids
@@ -87,11 +104,8 @@ def read(image: Path, as_json: bool) -> None:
     found = picture_findings(frame.image, frame.source)
     ids = [] if errors(found) else read_ids(frame.image)
     if not ids:
-        hint = "nearer (3 px a module at least), sharper, less tilted, no glare"
-        none = (
-            [] if errors(found) else [Finding("ID-NONE", "no specimen id in the picture", where=str(image), hint=hint)]
-        )
-        raise RefusedError(f"{image}: nothing to read", [*found, *none])
+        reasons = found if errors(found) else [*found, _why_no_id(frame.image, image)]
+        raise RefusedError(f"{image}: nothing to read", reasons)
     place = lab()
     rows = []
     for engraved in ids:

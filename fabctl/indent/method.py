@@ -151,22 +151,28 @@ def read_predicted(path: Path) -> Predicted:
 
 def time_s(plan: Sequence[Action], travel_speed_mm_s: float, approach_mm: float = 10.0) -> float:
     """Return about how long the plan takes; waiting for the operator counts nothing."""
-    total, depth_mm, clearance_mm = 0.0, 0.0, 1.0
+    return sum(times_s(plan, travel_speed_mm_s, approach_mm))
+
+
+def times_s(plan: Sequence[Action], travel_speed_mm_s: float, approach_mm: float = 10.0) -> list[float]:
+    """Return about how long each action takes."""
+    found, depth_mm, clearance_mm = [], 0.0, 1.0
     for action in plan:
-        total += action.time_s + 0.1
+        own = action.time_s + 0.1
         if action.kind == "approach":
             clearance_mm = action.clearance_mm
-            total += approach_mm / action.speed_mm_s + clearance_mm / action.speed_mm_s
+            own += approach_mm / action.speed_mm_s + clearance_mm / action.speed_mm_s
             depth_mm = -clearance_mm
         elif action.kind in ("load", "unload", "preload"):
             goal = (
                 action.depth_mm if action.depth_mm is not None else (-clearance_mm if action.kind == "unload" else 2.0)
             )
-            total += abs(goal - depth_mm) / action.speed_mm_s
+            own += abs(goal - depth_mm) / action.speed_mm_s
             depth_mm = goal
         elif action.kind == "travel":
-            total += 2 * approach_mm / travel_speed_mm_s + 15 / action.speed_mm_s
-    return total
+            own += 2 * approach_mm / travel_speed_mm_s + 15 / action.speed_mm_s
+        found.append(own)
+    return found
 
 
 def check(
@@ -251,7 +257,7 @@ def _against(predicted: Predicted, deepest_mm: float, method: MethodConfig, rig:
 
 def _order(plan: Sequence[Action]) -> Iterator[Finding]:
     """Say where a step needs another before it."""
-    tared = found_contact = False
+    tared = found_contact = pressed = touching = False
     for k, action in enumerate(plan):
         where = f"step {k + 1} ({action.kind})"
         if action.kind == "travel":
@@ -266,3 +272,20 @@ def _order(plan: Sequence[Action]) -> Iterator[Finding]:
                 )
         elif action.kind in ("load", "preload", "zero", "unload") and not found_contact:
             yield Finding("METHOD-APPROACH", "no contact is known here", where=where, hint="add {step: approach}")
+        if action.kind == "tare" and touching:
+            text = "a tare while the specimen is pressed would take its force for zero"
+            yield Finding("METHOD-TARE-PRESSED", text, where=where, hint="unload before it")
+        touching = _touches(action, touching)
+        if action.kind == "load" and pressed:
+            text = "this curve begins under a preload: without a zero after it nothing can be counted from contact"
+            yield Finding("METHOD-PRELOAD", text, "warning", where=where, hint="add {step: zero} after the preload")
+        pressed = action.kind == "preload" or (pressed and action.kind in ("hold", "wait", "tare"))
+
+
+def _touches(action: Action, before: bool) -> bool:
+    """Tell whether the indenter stands in contact after an action; `before` is how it stood."""
+    if action.kind in ("load", "preload"):
+        return True
+    if action.kind == "unload":
+        return action.depth_mm is not None or action.force_N is not None
+    return before and action.kind not in ("approach", "travel")

@@ -65,13 +65,15 @@ def read_cloud(path: Path, seed: int = 0, most: int = MOST_POINTS) -> Cloud:
         _must_be_ply(path)
     header = ply_header(path) if kind == ".ply" else None
     skipped: list[int] = []
+    said: list[Finding] = []
     if kind in (".las", ".laz"):
         found = _drawn(path, las_pieces(path), seed, most)
     elif kind in (".xyz", ".txt", ".csv"):
-        found = _drawn(path, text_pieces(path, skipped), seed, most)
-        if len(found.points) == 0 and not found.findings:
-            said = Finding("SCAN-TEXT", "no line holds three numbers", where=str(path), hint="one point a line: x y z")
-            raise UnreadableInput(f"{path}: cannot be compared", [said])
+        found = _drawn(path, text_pieces(path, skipped, said), seed, most)
+        found = replace(found, findings=(*said, *found.findings))
+        if len(found.points) == 0 and len(found.findings) == len(said):
+            none = Finding("SCAN-TEXT", "no line holds three numbers", where=str(path), hint="one point a line: x y z")
+            raise UnreadableInput(f"{path}: cannot be compared", [none])
         if sum(skipped) > 1:
             lines = Finding("SCAN-LINES", f"{sum(skipped)} lines hold no point", level="warning")
             found = replace(found, findings=(*found.findings, lines))

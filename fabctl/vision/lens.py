@@ -94,12 +94,14 @@ def find_board(image: NDArray[np.uint8], board: Charuco, source: str) -> tuple[B
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[board.family]))
     size = (board.columns_count, board.rows_count)
     print_ = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary, board.ids)
+    print_.setLegacyPattern(board.legacy)
     detector = cv2.aruco.CharucoDetector(print_)
     corners, ids, _, marker_ids = detector.detectBoard(image)
     seen = set() if marker_ids is None else {int(k) for k in np.ravel(marker_ids)}
     count = 0 if ids is None else len(ids)
     strange = seen - {int(k) for k in board.ids}
-    if len(strange) > len(seen) / 4 and len(strange) >= 3:
+    # Marks of the bed around the board are strange too, and do no harm.
+    if len(strange) > len(seen) - len(strange) and len(strange) >= 3:
         hint = "give the board file of the board in the picture"
         return None, [
             Finding(
@@ -132,7 +134,9 @@ def _layout_error(view: BoardView, board: Charuco) -> float:
 
 def _misfit(source: str, board: Charuco) -> Finding:
     text = f"the corners do not lie as {board.name} ({board.columns_count} x {board.rows_count}) says"
-    return Finding("LENS-BOARD", text, where=source, hint="another board, or a bent one")
+    return Finding(
+        "LENS-BOARD", text, where=source, hint="another board, a bent one, or of an old program (legacy: true)?"
+    )
 
 
 def calibrate(views: Sequence[BoardView], size_px: tuple[int, int], board: Charuco, made_utc: str) -> Calibration:
@@ -206,11 +210,16 @@ def _rotation(turn: F64) -> F64:
 
 def _coverage(views: Sequence[BoardView], size_px: tuple[int, int]) -> float:
     """Return which part of the frame's cells holds at least one corner."""
+    return len(covered_cells(views, size_px)) / math.prod(COVERAGE_CELLS)
+
+
+def covered_cells(views: Sequence[BoardView], size_px: tuple[int, int]) -> set[tuple[int, int]]:
+    """Return column and row of every cell of the frame that holds at least one corner."""
     if not views:
-        return 0.0
+        return set()
     points = np.vstack([view.corners_px for view in views]) / np.array(size_px)
     cells = np.clip((points * np.array(COVERAGE_CELLS)).astype(int), 0, np.array(COVERAGE_CELLS) - 1)
-    return len({tuple(cell) for cell in cells}) / math.prod(COVERAGE_CELLS)
+    return {(int(column), int(row)) for column, row in cells}
 
 
 def _disagreement(first: tuple[F64, F64], second: tuple[F64, F64], size_px: tuple[int, int]) -> float:
