@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,9 +29,13 @@ LARGEST_MM = 20_000.0  # of a bed or a sheet
 
 def size(text: str) -> tuple[float, float]:
     """Return both numbers of `200x150`."""
-    w, h = (float(part) for part in text.lower().split("x"))
+    parts = text.lower().split("x")
+    try:
+        w, h = (float(part) for part in parts)
+    except ValueError:
+        w = h = math.nan
     if not (0 < w <= LARGEST_MM and 0 < h <= LARGEST_MM):
-        raise ValueError(text)
+        raise click.BadParameter(f"{text!r} is not two numbers above zero and up to {LARGEST_MM:g}, such as 300x200")
     return w, h
 
 
