@@ -51,9 +51,15 @@ def board() -> None:
 
 @board.command("charuco")
 @click.option("--squares", type=size, metavar="WxH", default="10x7", show_default=True, help="Columns and rows.")
-@click.option("--square-mm", type=click.FloatRange(1, 1000), default=20.0, show_default=True)
-@click.option("--marker-mm", type=click.FloatRange(0.5, 1000), default=15.0, show_default=True)
-@click.option("--name", default="lens", show_default=True)
+@click.option("--square-mm", type=click.FloatRange(1, 1000), default=20.0, show_default=True, help="Side of a square.")
+@click.option(
+    "--marker-mm",
+    type=click.FloatRange(0.5, 1000),
+    default=15.0,
+    show_default=True,
+    help="Side of the marker in a square.",
+)
+@click.option("--name", default="lens", show_default=True, help="The board's name.")
 @json_option
 def charuco(squares: tuple[float, float], square_mm: float, marker_mm: float, name: str, as_json: bool) -> None:
     """Make a ChArUco board for the lens."""
@@ -139,7 +145,7 @@ def _write_board(made: Charuco | MarkSheet, as_json: bool) -> None:
 
 @command.command("show")
 @bench_option
-@click.option("-o", "--output", type=PhotoFile(), default=Path("bed.png"), show_default=True)
+@click.option("-o", "--output", type=PhotoFile(), default=Path("bed.png"), show_default=True, help="The file to write.")
 @json_option
 def show_picture(bench_name: str, output: Path, as_json: bool) -> None:
     """Take one picture of the bed and say whether it can be measured in."""
@@ -307,7 +313,12 @@ def check(image: Path | None, bench_name: str, as_json: bool) -> None:
 )
 @click.option("--design", type=InFolder(), default=None, help="Design folder whose job is drawn and checked.")
 @click.option(
-    "-o", "--output", type=OutFile((".json",), "a registration"), default=Path("registration.json"), show_default=True
+    "-o",
+    "--output",
+    type=OutFile((".json",), "a registration"),
+    default=Path("registration.json"),
+    show_default=True,
+    help="The file to write.",
 )
 @image_option
 @bench_option

@@ -145,8 +145,9 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
     type=click.Choice(["csv", "parquet", "hdf5", "bluesky"]),
     default="csv",
     show_default=True,
+    help="Of the file.",
 )
-@click.option("-o", "--output", type=OutFile(), required=True)
+@click.option("-o", "--output", type=OutFile(), required=True, help="The file to write.")
 @json_option
 def export_command(run: str, kind: str, output: Path, as_json: bool) -> None:
     """Write the samples of RUN for other programs: CSV with units, Parquet, HDF5, or bluesky documents."""

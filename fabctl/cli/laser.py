@@ -209,7 +209,9 @@ def _go_around(laser: Laser, bench: Bench, corners: tuple[str, ...], power_frac:
 @click.option("--powers", default="0.2,0.4,0.6,0.8,1.0", show_default=True, help="Fractions of full power.")
 @click.option("--feeds", default="10,15,20,25,30", show_default=True, help="Speeds, mm/s.")
 @click.option("--passes", default="1", show_default=True, help="Numbers of passes.")
-@click.option("--cell-mm", type=click.FloatRange(2, 200), default=8.0, show_default=True)
+@click.option(
+    "--cell-mm", type=click.FloatRange(2, 200), default=8.0, show_default=True, help="Side of one square of the grid."
+)
 @click.option("-o", "--out", type=OutFile(), help="Only write the program to this file.")
 @bench_option
 @yes_option

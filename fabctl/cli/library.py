@@ -58,8 +58,10 @@ def show_command(file: Path | None, as_json: bool) -> None:
 @click.option(
     "--t-mm", type=click.FloatRange(-1000, 1000), help="Plot energy and force of this cell instead of the maps."
 )
-@click.option("--theta-deg", type=click.FloatRange(-360, 360))
-@click.option("-o", "--output", type=PictureFile(), default=Path("library.svg"), show_default=True)
+@click.option("--theta-deg", type=click.FloatRange(-360, 360), help="Direction of slit 1 of that cell.")
+@click.option(
+    "-o", "--output", type=PictureFile(), default=Path("library.svg"), show_default=True, help="The picture to write."
+)
 @json_option
 def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output: Path, as_json: bool) -> None:
     """Draw the four maps, or energy and force of one cell along its uniaxial stretch."""

@@ -32,7 +32,14 @@ REACH_S = 5.0  # a scheduler that takes longer to be reached is not there
 )
 @jobs_option
 @click.option("--cluster", metavar="URL", help="A dask scheduler, tcp://HOST:PORT, whose workers have fabctl.")
-@click.option("-o", "--output", type=OutFile((".npz",), "a library"), default=Path("library.npz"), show_default=True)
+@click.option(
+    "-o",
+    "--output",
+    type=OutFile((".npz",), "a library"),
+    default=Path("library.npz"),
+    show_default=True,
+    help="The library file to write.",
+)
 @json_option
 def build(
     material: str,

@@ -64,7 +64,7 @@ def tare(bench_name: str, time_s: float, as_json: bool) -> None:
 
 @command.command()
 @bench_option
-@click.option("--speed-mm-s", type=SPEED_MM_S, default=5.0, show_default=True)
+@click.option("--speed-mm-s", type=SPEED_MM_S, default=5.0, show_default=True, help="How fast the stage moves.")
 @yes_option
 @json_option
 def home(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
@@ -75,7 +75,7 @@ def home(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
 @command.command()
 @click.argument("by_mm", type=PLACE_MM)
 @bench_option
-@click.option("--speed-mm-s", type=SPEED_MM_S, default=1.0, show_default=True)
+@click.option("--speed-mm-s", type=SPEED_MM_S, default=1.0, show_default=True, help="How fast the stage moves.")
 @yes_option
 @json_option
 def jog(by_mm: float, bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
@@ -92,7 +92,7 @@ def jog(by_mm: float, bench_name: str, speed_mm_s: float, yes: bool, as_json: bo
 
 @command.command()
 @bench_option
-@click.option("--speed-mm-s", type=SPEED_MM_S, default=1.0, show_default=True)
+@click.option("--speed-mm-s", type=SPEED_MM_S, default=1.0, show_default=True, help="How fast the stage moves.")
 @yes_option
 @json_option
 def retract(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
@@ -131,7 +131,13 @@ def calibrate() -> None:
 
 @calibrate.command("force")
 @click.option(
-    "--mass-g", "masses_g", type=click.FloatRange(0, 1e6), multiple=True, default=(0, 100, 200, 500), show_default=True
+    "--mass-g",
+    "masses_g",
+    type=click.FloatRange(0, 1e6),
+    multiple=True,
+    default=(0, 100, 200, 500),
+    show_default=True,
+    help="A known mass; one option each.",
 )
 @click.option(
     "--valid-days",
@@ -187,7 +193,13 @@ def calibrate_force_command(
     show_default=True,
     help="What the block itself gives.",
 )
-@click.option("--valid-days", type=click.IntRange(1, 36_500), default=365, show_default=True)
+@click.option(
+    "--valid-days",
+    type=click.IntRange(1, 36_500),
+    default=365,
+    show_default=True,
+    help="After how many days it is past its date.",
+)
 @bench_option
 @yes_option
 @json_option

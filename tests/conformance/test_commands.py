@@ -63,3 +63,8 @@ def test_every_number_on_the_command_line_has_two_ends() -> None:
     ]
     assert len(numbers) > 40
     assert [n for n in numbers if not isinstance(n[2], ranges) or n[2].min is None or n[2].max is None] == []
+
+
+def test_every_option_says_what_it_is() -> None:
+    options = [(path, p) for path, found in every_command() for p in found.params if isinstance(p, click.Option)]
+    assert [(path, p.opts[-1]) for path, p in options if not p.help] == []
