@@ -30,9 +30,13 @@ if TYPE_CHECKING:
     show_default=True,
     help="What the rim stands on, with --gravity.",
 )
-@click.option("--friction", type=click.FloatRange(0), default=0.5, show_default=True, help="Coefficient for coulomb.")
+@click.option(
+    "--friction", type=click.FloatRange(0, 10), default=0.5, show_default=True, help="Coefficient for coulomb."
+)
 @click.option("--level-floor", is_flag=True, help="A level floor instead of a bed made to the rim.")
-@click.option("--shapes", type=click.IntRange(0), default=0, help="Look for other equilibria from this many starts.")
+@click.option(
+    "--shapes", type=click.IntRange(0, 10_000), default=0, help="Look for other equilibria from this many starts."
+)
 @click.option("--parts", type=click.IntRange(1, 6), default=1, show_default=True, help="Triangles along a unit's side.")
 @click.option(
     "--compensate",
