@@ -15,6 +15,7 @@ from design.cells.monostable import monostable_cells
 from design.cells.select import Choice, SelectionCurve, on_curve, select, selection_curve
 from design.cells.sheet import Sheet
 from design.compensated import compensated
+from design.deploy.supports import Support
 from design.errors import OutOfLibrary
 from design.findings import Finding
 from design.flatten import Flattening, Limits, feasibility, flatten
@@ -116,7 +117,8 @@ def build(
     flat, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)
     if spec.compensate:
         cut = np.array([kind == "cut" for kind in kinds_of(spec, tiling)])
-        wanted, choice = compensated(flat, tiling, wanted, choice, cut, library, curve, wide, found, watch)
+        rim: Support = "free" if spec.compensate is True else spec.compensate
+        wanted, choice = compensated(flat, tiling, wanted, choice, cut, library, curve, wide, found, watch, rim)
     hinge = hinges_mm(spec, choice, library)
     if curve is None and np.abs(hinge - base.sheet.hinge_mm).max() > HINGE_SAME_MM:
         choice, changed = as_cut(base, choice, hinge)

@@ -16,6 +16,7 @@ from design.cells.select import Choice
 from design.deploy.equilibrium import from_flat, pushed_flat
 from design.deploy.indentation import Response, indentation_response
 from design.deploy.levels import Layout, sheet_layout, weld
+from design.deploy.newton import System, smallest_eigenvalue_N_mm
 from design.deploy.predict import Deployed, deploy
 from design.deploy.search import same_shape
 from design.errors import NotConverged
@@ -35,6 +36,7 @@ class Predicted:
     deployed: Deployed
     response: Response
     findings: tuple[Finding, ...]
+    smallest_eigenvalue_N_mm: float  # of the deployed shape: how far it is from giving way
 
 
 def predict(
@@ -59,7 +61,9 @@ def predict(
         None if options.point_mm is None else np.array(options.point_mm),
         watch=lambda share: watch("pressing the indenter", 0.8 + 0.2 * share),
     )
-    return Predicted(deployed, response, (*_doubts(library), *_other_side(layout, deployed, tiling.twins is not None)))
+    softest = smallest_eigenvalue_N_mm(System(layout.shell()), deployed.equilibrium.x_mm, (), None)
+    doubts = (*_doubts(library), *_other_side(layout, deployed, tiling.twins is not None))
+    return Predicted(deployed, response, doubts, softest)
 
 
 def _other_side(layout: Layout, deployed: Deployed, is_tube: bool) -> list[Finding]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from design.cells.library import CellLibrary, hexagon_mm2
 from design.cells.sheet import Sheet
 from design.deploy.cascade import Wells
 from design.deploy.designed import lift
-from design.deploy.levels import Layout, sheet_layout
+from design.deploy.levels import Layout, prolong, refine, sheet_layout
 from design.deploy.shell import Reals
 from design.findings import Finding
 from design.meshfiles import read_mesh
@@ -83,6 +83,16 @@ def read_laid(folder: Path, home: Path) -> Laid:
         goal = lift(flat, paper.vertices_mm[:, :2], paper.faces, target.vertices_mm, target.faces)
     layout = sheet_layout(flat, shape.faces, expansion, Y, nu, D)
     return Laid(layout, shape.vertices_mm, target, goal, sheet, t, theta, library)
+
+
+def divided(laid: Laid, parts: int) -> Laid:
+    """Return the same sheet with `parts`² triangles a unit."""
+    fine = refine(laid.layout, parts)
+    start, design = (
+        None if places is None else prolong(laid.layout, places, fine) for places in (laid.start_mm, laid.design_mm)
+    )
+    assert start is not None
+    return replace(laid, layout=fine, start_mm=start, design_mm=design)
 
 
 def wells_of(laid: Laid) -> Wells:

@@ -7,11 +7,12 @@ import re
 from dataclasses import dataclass
 from dataclasses import replace as changed
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import yaml
 
-from design.bundle import Bundle, write_bundle, write_coupon_bundle
+from design.bundle import Bundle, refuse_taken, write_bundle, write_coupon_bundle
 from design.cells.contracting import load_contracting
 from design.cells.library import CellLibrary, load_library
 from design.cells.select import select
@@ -19,19 +20,23 @@ from design.cells.sheet import Sheet
 from design.coupon import Coupon, coupon
 from design.export.gcode import GcodeOptions
 from design.findings import Finding
+from design.flatten.cut import chain_through
 from design.job import JobOptions, compose_job
 from design.meshfiles import read_given_flat, read_mesh
 from design.pattern.paths import Layer, LayerPreset
 from design.pattern.toolpath import ToolOptions
 from design.pipeline import Design, build
-from design.spec import DesignSpec, Kind
+from design.spec import DesignSpec, Kind, Rim
 from design.surface import TriMesh
 from design.targets import TARGETS
+from fabctl.config.bench import names
 from fabctl.config.coupon import CouponConfig
 from fabctl.config.material import LayerConfig, MaterialConfig, load_material
 from fabctl.config.spec import MadeTarget, SpecConfig, ToolConfig, load_spec
 from fabctl.errors import RefusedError, UsageError
 from fabctl.events import Emit, Event, silent
+
+WRITING_FROM_FRAC = 0.99  # of a build: what is left is writing the folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +81,10 @@ def _inputs_of(
     if config.flatten.source == "target":
         flat_mm = read_given_flat(target_file(config, beside, target), mesh)
         spec = changed(spec, flatten=changed(spec.flatten, given_mm=flat_mm))
+    if config.flatten.cut_mm is not None:
+        spec = changed(
+            spec, flatten=changed(spec.flatten, cut_path=chain_through(mesh, np.array(config.flatten.cut_mm)))
+        )
     file = library or library_file(config, beside)
     cells = library_of(config, file).scaled(sheet)
     return Inputs(spec, keeping("library", file, text), mesh, cells, presets, tuple(findings))
@@ -102,18 +111,28 @@ def keeping(key: str, value: Path | None, text: str) -> str:
 
 def inputs_for(
     target: str,
-    material: str,
+    material: str | None,
     home: Path,
     cell_mm: float | None = None,
-    cells: Kind = "expanding",
+    cells: Kind | None = None,
     library: Path | None = None,
 ) -> Inputs:
-    """Return the inputs for a target alone: a specification, a mesh file, or the name of one of our own surfaces."""
-    if Path(target).suffix in (".yaml", ".yml"):
+    """Return the inputs for a specification, a mesh file, or the name of one of our own surfaces.
+
+    A name that is both, such as `cap`, is the specification, as for `fabctl design build`; the surface where `material`
+    or `cells` are given, which a specification says itself.
+    """
+    is_spec = Path(target).suffix in (".yaml", ".yml") or target in names("specs", home)
+    if is_spec and material is None and cells is None:
         return read_inputs(target, home, None, cell_mm, library)
+    if is_spec and target not in TARGETS:
+        raise UsageError(f"{target}: a specification says its material and cells itself; change them there")
     source: str | MadeTarget = MadeTarget(make=target) if target in TARGETS else target
     config = SpecConfig(
-        name=re.sub(r"\W", "-", Path(target).stem) or "target", target=source, material=material, cells=cells
+        name=re.sub(r"\W", "-", Path(target).stem) or "target",
+        target=source,
+        material=material or SpecConfig.model_fields["material"].default,
+        cells=cells or "expanding",
     )
     return _inputs_of(config, "", Path.cwd(), home, None, cell_mm, library)
 
@@ -122,7 +141,7 @@ def design_of(inputs: Inputs, emit: Emit = silent) -> Design:
     """Return the design of the inputs."""
 
     def watch(message: str, done_frac: float) -> None:
-        emit(Event("progress", message, done_frac))
+        emit(Event("progress", message, WRITING_FROM_FRAC * done_frac))
 
     return build(inputs.spec, inputs.mesh, inputs.library, inputs.presets, watch, inputs.findings)
 
@@ -139,27 +158,35 @@ def build_folder(
     library: Path | None = None,
 ) -> tuple[Design, Bundle]:
     """Build the specification called `name` into `folder`; return the design and its folder."""
+    refuse_taken(folder, replace)
     inputs = read_inputs(name, home, target, cell_mm, library)
     if compensate:
         inputs = changed(inputs, spec=changed(inputs.spec, compensate=True))
     design = design_of(inputs, emit)
-    emit(Event("progress", "writing the design folder", 0.99))
-    return design, write_bundle(design, inputs.text, folder, replace)
+    emit(Event("progress", "writing the design folder", WRITING_FROM_FRAC))
+    bundle = write_bundle(design, inputs.text, folder, replace)
+    emit(Event("progress", "written", 1.0))
+    return design, bundle
 
 
-def build_compensated(bundle: Bundle, folder: Path, home: Path, emit: Emit = silent) -> tuple[Design, Finding]:
+def build_compensated(
+    bundle: Bundle, folder: Path, home: Path, emit: Emit = silent, rim: Literal[True] | Rim = True
+) -> tuple[Design, Finding]:
     """Build a design folder anew with compensated expansions; raise `RefusedError` where they do not help.
+
+    `rim` says on what the sheet bears its weight; True: it is free of both.
 
     The specification kept in the new folder asks for the compensation itself, so that it can be built from there.
     """
+    refuse_taken(folder)
     spec_path, target = bundle.file("spec.yaml"), bundle.file("target.ply")
     cell_mm = bundle.manifest["facts"].get("cell_mm")  # the command line may have asked for other cells than the file
     inputs = read_inputs(str(spec_path), home, target, cell_mm)
-    design = design_of(changed(inputs, spec=changed(inputs.spec, compensate=True)), emit)
+    design = design_of(changed(inputs, spec=changed(inputs.spec, compensate=rim)), emit)
     told = next((f for f in design.findings if f.code in ("COMPENSATED", "COMPENSATE-NOT")), None)
     if told is None or told.code == "COMPENSATE-NOT":
         raise RefusedError("the design was not compensated", [told] if told else [])
-    text = re.sub(r"(?m)^compensate:.*\n", "", inputs.text).rstrip("\n") + "\ncompensate: true\n"
+    text = re.sub(r"(?m)^compensate:.*\n", "", inputs.text).rstrip("\n") + f"\ncompensate: {str(rim).lower()}\n"
     write_bundle(design, text, folder)
     return design, told
 
@@ -207,8 +234,8 @@ def sheet_of(material: MaterialConfig, edge_mm: float) -> Sheet:
 
 def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
     """Return how each layer is cut; raise `RefusedError` for a material that must not, or cannot yet, be cut."""
-    if material.never_cut_because:
-        danger = Finding("MATERIAL-NEVER", material.never_cut_because, where=material.name)
+    if material.danger:
+        danger = Finding("MATERIAL-NEVER", material.danger, where=material.name)
         raise RefusedError(f"{material.name} must not be cut", [danger])
     if material.laser is None:
         missing = Finding("MATERIAL-LASER", "has no laser preset", where=material.name, hint="cut a power-speed grid")

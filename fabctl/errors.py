@@ -46,6 +46,12 @@ class RefusedError(FabctlError):
         return "\n  ".join([self.what, *map(str, self.findings)])
 
 
+class UnreadableInput(RefusedError):
+    """A file is not of the kind that was expected, or holds nothing of it."""
+
+    exit_code = USAGE
+
+
 class RecordError(FabctlError):
     """A run folder cannot be written or read."""
 

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import click
 
+from fabctl.cli.paths import config_names
 from fabctl.cli.refusal import answer_no, exit_code_of, plain, refusal, sentence_of
 from fabctl.errors import BUG, DONE, OPERATOR
 from fabctl.events import Emit, Event
@@ -23,7 +24,15 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 yes_option = click.option("--yes", is_flag=True, help="Answer every question with yes (for scripts).")
-bench_option = click.option("--bench", "bench_name", default="sim", show_default=True, help="Bench file or its name.")
+bench_option = click.option(
+    "--bench",
+    "bench_name",
+    type=config_names("benches"),
+    default="sim",
+    show_default=True,
+    help="Bench file or its name.",
+)
+MATERIAL = config_names("materials")
 
 
 def lab() -> Workspace:

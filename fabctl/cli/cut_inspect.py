@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fabctl.cli.common import bench_option, json_option, lab, show
+from fabctl.cli.paths import SPECIMEN, InFile, PhotoFile
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,16 +17,15 @@ if TYPE_CHECKING:
     from drivers.camera import Frame
     from fabctl.records.folder import RunFolder
 
-PATH = click.Path(path_type=Path)
-FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
-
 
 @click.command("inspect")
-@click.argument("specimen")
+@click.argument("specimen", type=SPECIMEN)
 @click.option("--thickness-mm", type=float, default=None, help="The sheet's; its material's when not given.")
-@click.option("--registration", type=FILE, help="Where the sheet lies now, if it was moved since the cut.")
-@click.option("-o", "--output", type=PATH, default=Path("inspection.png"), show_default=True, help="Annotated picture.")
-@click.option("--image", type=FILE, help="A picture of the bed, instead of the bench's camera.")
+@click.option("--registration", type=InFile(), help="Where the sheet lies now, if it was moved since the cut.")
+@click.option(
+    "-o", "--output", type=PhotoFile(), default=Path("inspection.png"), show_default=True, help="Annotated picture."
+)
+@click.option("--image", type=InFile(), help="A picture of the bed, instead of the bench's camera.")
 @bench_option
 @json_option
 def inspect_command(

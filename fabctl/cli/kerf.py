@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import bench_option, json_option, lab, show, yes_option
+from fabctl.cli.common import MATERIAL, bench_option, json_option, lab, show, yes_option
 from fabctl.cli.finite import numbers
+from fabctl.cli.paths import InFile, InFolder, OutFolder
 
 if TYPE_CHECKING:
     from fabctl.vision.coupon import Coupon
     from fabctl.vision.kerf import KerfMeasurement
-
-PATH = click.Path(path_type=Path)
-FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.group("kerf")
@@ -25,9 +22,13 @@ def command() -> None:
 
 
 @command.command("coupon")
-@click.option("--material", required=True, help="Material file or its name; its preset gives speed and passes.")
+@click.option(
+    "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives speed and passes."
+)
 @click.option("--powers", default=None, metavar="0.4,0.5,…", help="Power steps; around the preset's when not given.")
-@click.option("-o", "--output", type=PATH, default=Path("coupon"), show_default=True, help="Folder to write into.")
+@click.option(
+    "-o", "--output", type=OutFolder(), default=Path("coupon"), show_default=True, help="Folder to write into."
+)
 @bench_option
 @json_option
 def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_json: bool) -> None:
@@ -43,8 +44,8 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
     from fabctl.vision import coupon as coupons
 
     stuff = load_material(material, lab().root)
-    if stuff.never_cut_because or stuff.laser is None:
-        raise UsageError(f"{stuff.name}: {stuff.never_cut_because or 'no laser preset'}; it is not cut")
+    if stuff.danger or stuff.laser is None:
+        raise UsageError(f"{stuff.name}: {stuff.danger or 'no laser preset'}; it is not cut")
     laser = load_bench(bench_name, lab().root).laser
     if laser is None:
         raise UsageError(f"bench {bench_name} has no laser")
@@ -70,7 +71,7 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
 
 
 @command.command("cut")
-@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("folder", type=InFolder())
 @click.option("--origin", type=click.Choice(["home", "here"]), default="home", show_default=True)
 @click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
 @bench_option
@@ -111,32 +112,33 @@ def cut_coupon(folder: Path, origin: str, dry_run: bool, bench_name: str, yes: b
 def read_coupon(path: Path) -> tuple[Coupon, str]:
     """Return the coupon in a `coupon.json`, and the material it is for; raise `UsageError` where it is none."""
     from fabctl.errors import UsageError
+    from fabctl.files import json_of, why_not
     from fabctl.vision.coupon import coupon_from
 
+    facts = json_of(path, "the coupon.json of `fabctl kerf coupon`")
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
         return coupon_from(facts, str(path)), str(facts["material"])
-    except OSError as fault:
-        raise UsageError(f"{path}: {fault.strerror}; `fabctl kerf coupon` makes one") from fault
     except (KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{path}: not a coupon: {fault}; `fabctl kerf coupon` makes one") from fault
+        raise UsageError(f"{path}: not a coupon: {why_not(fault)}; `fabctl kerf coupon` makes one") from fault
 
 
 @command.command("measure")
-@click.argument("image", type=FILE)
-@click.option("--coupon", "coupon_file", type=FILE, required=True, help="The coupon.json of the coupon in the picture.")
+@click.argument("image", type=InFile())
+@click.option(
+    "--coupon", "coupon_file", type=InFile(), required=True, help="The coupon.json of the coupon in the picture."
+)
 @click.option("--write", is_flag=True, help="Write the kerf into the lab's material file.")
 @click.option("--gamma", type=click.Choice(["srgb", "linear"]), default="srgb", show_default=True)
 @json_option
 def measure(image: Path, coupon_file: Path, write: bool, gamma: str, as_json: bool) -> None:
     """Measure the kerf per power and direction in a picture of the coupon, with its uncertainty."""
-    from fabctl.cli.camera import picture_file
     from fabctl.config.material import load_material
     from fabctl.errors import UsageError
+    from fabctl.files import picture_of
     from fabctl.vision import kerf as kerfs
 
     made, material = read_coupon(coupon_file)
-    frame = picture_file(image)
+    frame = picture_of(image)
     found = kerfs.measure(frame.image, frame.source, made, gamma)
     data, lines = _table(found)
     if write:

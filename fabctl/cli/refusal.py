@@ -77,8 +77,8 @@ def refusal(fault: BaseException) -> dict[str, Any]:
 
 def answer_no(data: Mapping[str, Any], code: int, why: str) -> dict[str, Any]:
     """Return the result of a command whose answer is a no, with what every refusal says; `data` may name findings."""
-    word = {REFUSED: "REFUSED", DEVICE: "DEVICE", OUT_OF_TOLERANCE: "OUT-OF-TOLERANCE"}[code]
-    findings = data.get("findings") or [Finding(word, why).as_dict()]
+    words = {USAGE: "USAGE", REFUSED: "REFUSED", DEVICE: "DEVICE", OUT_OF_TOLERANCE: "OUT-OF-TOLERANCE"}
+    findings = data.get("findings") or [Finding(words.get(code, "FAILED"), why).as_dict()]
     return {"error": why, "exit_code": code, **data, "findings": findings}
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import bench_option, json_option, lab, progress, say, show
+from fabctl.cli.paths import RUN, SPECIMEN_OR_FILE, InFile, InFolder, config_names
 from fabctl.errors import REFUSED, FabctlError, RefusedError, Stopped, UsageError
 
 if TYPE_CHECKING:
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from fabctl.vision.boards import MarkSheet
     from fabctl.workspace import Specimen, Workspace
 
-FILE = click.Path(path_type=Path, dir_okay=False)
-
 
 @click.group()
 def command() -> None:
@@ -29,8 +28,8 @@ def command() -> None:
 
 
 @command.command("run")
-@click.argument("words", nargs=-1, metavar="[SPECIMEN] [CLOUD]")
-@click.option("--target", type=FILE, help="Target mesh, for a cloud without a specimen.")
+@click.argument("words", nargs=-1, type=SPECIMEN_OR_FILE, metavar="[SPECIMEN] [CLOUD]")
+@click.option("--target", type=InFile(), help="Target mesh, for a cloud without a specimen.")
 @click.option(
     "--scale",
     type=click.Choice(["free", "known", "markers"]),
@@ -41,19 +40,25 @@ def command() -> None:
 @click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
 @click.option(
     "--markers",
-    type=FILE,
+    type=InFile(),
     help="Markers as scanned: label,x,y,z in cloud units; without it they are looked for in the cloud's colours.",
 )
-@click.option("--board", type=FILE, help="The board as measured: label,x,y,z in mm.")
-@click.option("--bars", type=FILE, help="Scale bars, x1,y1,z1,x2,y2,z2,length_mm: pairs of points in cloud units.")
+@click.option("--board", type=InFile(), help="The board as measured: label,x,y,z in mm.")
+@click.option("--bars", type=InFile(), help="Scale bars, x1,y1,z1,x2,y2,z2,length_mm: pairs of points in cloud units.")
+@click.option("--model", type=InFolder(), help="The scan's COLMAP text model (folder).")
+@click.option("--pictures", type=InFolder(), help="Its pictures  [MODEL/images].")
 @click.option(
-    "--model", type=click.Path(path_type=Path, file_okay=False), help="The scan's COLMAP text model (folder)."
+    "--marks",
+    type=config_names("boards"),
+    default="scale",
+    show_default=True,
+    help="The board whose coded marks the pictures show.",
 )
-@click.option("--pictures", type=click.Path(path_type=Path, file_okay=False), help="Its pictures  [MODEL/images].")
-@click.option("--marks", default="scale", show_default=True, help="The board whose coded marks the pictures show.")
-@click.option("--datum", type=FILE, help="Three or more points as scanned: label,x,y,z in cloud units.")
-@click.option("--datum-target", type=FILE, help="The same points on the target: label,x,y,z in mm.")
-@click.option("--colours", type=FILE, help="Coloured PLY in the target's frame, e.g. an earlier scan's colours.ply.")
+@click.option("--datum", type=InFile(), help="Three or more points as scanned: label,x,y,z in cloud units.")
+@click.option("--datum-target", type=InFile(), help="The same points on the target: label,x,y,z in mm.")
+@click.option(
+    "--colours", type=InFile(), help="Coloured PLY in the target's frame, e.g. an earlier scan's colours.ply."
+)
 @click.option(
     "--mode",
     type=click.Choice(["best-fit", "least-squares", "datum", "rim", "gravity-and-rim"]),
@@ -98,6 +103,8 @@ def run_scan(
         raise UsageError("name a specimen, or give --target")
     if scale != "markers" and (bars or model):
         raise UsageError("--bars and --model belong to --scale markers")
+    if pictures is not None and model is None:
+        raise UsageError(f"--pictures {pictures} belongs to --model, the scan's COLMAP text model")
     predicted = None if specimen is None else specimen.design / "deployed.ply"
     options: dict[str, Any] = {
         "scale": scale,
@@ -126,8 +133,8 @@ def run_scan(
 
 
 @command.command("batch")
-@click.argument("clouds", nargs=-1, required=True, type=FILE)
-@click.option("--target", type=FILE, required=True, help="Target mesh of all the clouds.")
+@click.argument("clouds", nargs=-1, required=True, type=InFile())
+@click.option("--target", type=InFile(), required=True, help="Target mesh of all the clouds.")
 @click.option("--scale", type=click.Choice(["free", "known"]), default="free", show_default=True)
 @click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
 @click.option("--tolerance-frac", type=click.FloatRange(min=0, min_open=True), help="Of the bounding-box diagonal.")
@@ -169,18 +176,17 @@ def run_batch(
 
 
 @command.command("compare")
-@click.argument("first")
-@click.argument("second")
+@click.argument("first", type=RUN)
+@click.argument("second", type=RUN)
 @json_option
 def compare_scans(first: str, second: str, as_json: bool) -> None:
     """Say how well scan run SECOND repeats FIRST: two scans of one specimen, or of one target."""
     from dataclasses import asdict
 
-    from fabctl.records.folder import open_run
     from fabctl.scan.repeat import compare_runs
 
     here = lab()
-    runs = [open_run(Path(name) if Path(name).is_dir() else here.runs / name) for name in (first, second)]
+    runs = [here.run(name) for name in (first, second)]
     found = compare_runs(*runs)
     lines = [
         f"repeatability {found.repeatability_mm:.3f} mm (one scan, bias removed); bias {found.bias_mm:+.3f} mm",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import json_option, lab, show
+from fabctl.cli.paths import SPECIMEN, InFile
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
 
     from design.findings import Finding
     from fabctl.workspace import Specimen
-
-FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.group("specimen")
@@ -48,7 +47,7 @@ def _record_or_fault(specimen: Specimen) -> dict[str, Any]:
 
 
 @command.command("show")
-@click.argument("name")
+@click.argument("name", type=SPECIMEN)
 @json_option
 def show_specimen(name: str, as_json: bool) -> None:
     """Show what is written about a specimen, and its runs."""
@@ -62,7 +61,7 @@ def show_specimen(name: str, as_json: bool) -> None:
 
 
 @command.command("note")
-@click.argument("name")
+@click.argument("name", type=SPECIMEN)
 @click.argument("facts", nargs=-1, required=True, metavar="KEY=VALUE…")
 @json_option
 def note(name: str, facts: tuple[str, ...], as_json: bool) -> None:
@@ -101,17 +100,17 @@ def _why_no_id(image: NDArray[np.uint8], path: Path) -> Finding:
 
 
 @command.command("read")
-@click.argument("image", type=FILE)
+@click.argument("image", type=InFile())
 @json_option
 def read(image: Path, as_json: bool) -> None:
     """Read the engraved ids in a picture, and say which runs they have."""
     from design.findings import errors
-    from fabctl.cli.camera import picture_file
     from fabctl.errors import RefusedError
+    from fabctl.files import picture_of
     from fabctl.vision.ids import read_ids
     from fabctl.vision.quality import picture_findings
 
-    frame = picture_file(image)
+    frame = picture_of(image)
     found = picture_findings(frame.image, frame.source)
     ids = [] if errors(found) else read_ids(frame.image)
     if not ids:

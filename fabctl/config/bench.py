@@ -74,13 +74,22 @@ def find(kind: str, name: str, home: Path) -> Path:
     direct = Path(name)
     if direct.suffix in (".yaml", ".yml") and direct.is_file():
         return direct
-    places = [home / "configs" / kind, Path(__file__).resolve().parents[2] / "configs" / kind]
-    for place in places:
+    for place in _places(kind, home):
         path = place / f"{name}.yaml"
         if path.is_file():
             return path
-    known = sorted({p.stem for place in places if place.is_dir() for p in place.glob("*.yaml")})
-    raise ConfigError([f"{name}: no such file, nor a name in configs/{kind} (known: {', '.join(known) or 'none'})"])
+    wrong = "is a folder" if direct.is_dir() else "is no YAML file" if direct.is_file() else "no such file"
+    known = ", ".join(names(kind, home)) or "none"
+    raise ConfigError([f"{name}: {wrong}, nor a name in configs/{kind} (known: {known})"])
+
+
+def names(kind: str, home: Path) -> list[str]:
+    """Return the names that `find` knows without a path."""
+    return sorted({path.stem for place in _places(kind, home) for path in place.glob("*.yaml")})
+
+
+def _places(kind: str, home: Path) -> tuple[Path, Path]:
+    return home / "configs" / kind, Path(__file__).resolve().parents[2] / "configs" / kind
 
 
 def load_bench(name: str, home: Path) -> BenchConfig:

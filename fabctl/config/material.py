@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,9 @@ from design.cells.sheet import Sheet
 from fabctl.config.bench import Positive, find
 from fabctl.config.loader import Model, load
 
+# Plastics and rubbers with chlorine, by the names they are sold under; `cr` and `csm` only as words of their own.
+CHLORINATED = re.compile(r"pvc|vinyl|chlor(?!ine.free)|neoprene|hypalon|(?<![a-z])(?:cr|csm)(?![a-z])", re.IGNORECASE)
+CHLORINE_DANGER = "the beam frees hydrogen chloride, which poisons people and rusts the machine"
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -36,7 +40,7 @@ class LaserPreset(Model):
 
 
 class MaterialConfig(Model):
-    """One sheet material. `never_cut_because` names the danger where a laser must not touch it."""
+    """One sheet material. `never_cut_because` names the danger where a laser must not touch it; see `danger`."""
 
     name: str
     E_MPa: Positive
@@ -48,6 +52,14 @@ class MaterialConfig(Model):
     hinge_mm: Positive = 0.25
     laser: LaserPreset | None = None
     never_cut_because: str | None = None
+
+    @property
+    def danger(self) -> str | None:
+        """Return why a laser must not touch this material: what its file says, else what its name gives away."""
+        if self.never_cut_because is not None:
+            return self.never_cut_because
+        found = CHLORINATED.search(self.name)
+        return f"{found[0]!r} in its name says chlorine; {CHLORINE_DANGER}" if found else None
 
 
 def load_material(name: str, home: Path) -> MaterialConfig:

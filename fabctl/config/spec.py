@@ -10,19 +10,20 @@ from pydantic import Field, model_validator
 
 from design.cells.select import Rule, SelectionOptions
 from design.flatten import FlattenOptions
-from design.flatten.result import Boundary, SeamChoice
+from design.flatten.result import Boundary, HoleChoice, SeamChoice
 from design.pattern.assign import Averaging, ScaleOptions, Which
 from design.pattern.border import BorderOptions
 from design.pattern.slits import HingeOptions, HingeRule
 from design.pattern.tiling import Placement
 from design.pattern.toolpath import Sides, ToolOptions
-from design.spec import DesignSpec, Infeasible, Kind, Region, ResponseOptions
+from design.spec import DesignSpec, Infeasible, Kind, Region, ResponseOptions, Rim
 from fabctl.config.bench import Positive, find
 from fabctl.config.loader import Model, load
 
 Length = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 Count = Annotated[int, Field(ge=0)]
+Point = tuple[float, float, float]
 
 
 class MadeTarget(Model):
@@ -48,7 +49,9 @@ class FlattenConfig(Model):
     source: Literal["computed", "target"] = "computed"
     boundary: Boundary = "isometric"
     modes_count: Count = 24
+    holes: HoleChoice = "auto"
     seam: SeamChoice = "auto"
+    cut_mm: Annotated[tuple[Point, ...], Field(min_length=2)] | None = None
     cones_count: Count = 0
 
     @model_validator(mode="after")
@@ -156,7 +159,7 @@ class SpecConfig(Model):
     border: BorderConfig = BorderConfig()
     tool: ToolConfig = ToolConfig()
     bed_mm: tuple[Positive, Positive] | None = None
-    compensate: bool = False
+    compensate: bool | Rim = False
     response: ResponseConfig | None = ResponseConfig()
 
     @model_validator(mode="after")
@@ -184,7 +187,7 @@ class SpecConfig(Model):
             name=self.name,
             cells=self.cells,
             cell_mm=cell_mm,
-            flatten=FlattenOptions(**self.flatten.model_dump(exclude={"source"})),
+            flatten=FlattenOptions(**self.flatten.model_dump(exclude={"source", "cut_mm"})),
             infeasible=self.infeasible,
             averaging=self.averaging,
             scale=ScaleOptions(self.scale.end, self.scale.high_ratio),

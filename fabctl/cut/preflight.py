@@ -50,11 +50,11 @@ def preflight(
 
 def _material(material: MaterialConfig, sheet: Sheet | None) -> list[Finding]:
     found = []
-    if material.never_cut_because is not None:
+    if material.danger is not None:
         found.append(
             Finding(
                 "CUT-MATERIAL-DANGER",
-                f"{material.name} must not be cut: {material.never_cut_because}",
+                f"{material.name} must not be cut: {material.danger}",
                 hint="take another material",
             )
         )

@@ -148,6 +148,7 @@ def _one(numbered: Numbered) -> dict[str, Any]:
         "contact_spread_mm": contact.spread_mm,
         "contact_others_mm": dict(contact.others_mm),
         "noise_N": contact.noise_N,
+        "drift_N_mm": contact.drift_N_mm,
         "depth_max_mm": result.depth_max_mm,
         "not_found": dict(result.reasons),
     }

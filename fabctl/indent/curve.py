@@ -152,9 +152,9 @@ def _stiffness(
     else:
         # An error of the contact moves the depth at which the force is read, and the depth it is divided by.
         shift = (at.slope_N_mm - at.force_N / secant_mm) * (contact.se_mm or 0.0)
-        found["stiffness_secant_N_mm"] = Valued(
-            at.force_N / secant_mm, T95 * float(np.hypot(at.force_se_N, shift)) / secant_mm
-        )
+        doubt = T95 * float(np.hypot(at.force_se_N, shift)) / secant_mm
+        # Whether the drift before contact goes on under load, nobody knows: it widens the interval and stays in.
+        found["stiffness_secant_N_mm"] = Valued(at.force_N / secant_mm, doubt + abs(contact.drift_N_mm))
     places = np.arange(LOCAL_MM, float(depth.max()) - LOCAL_MM, LOCAL_MM / 2)
     slopes = [fit for place in places if (fit := local_fit(depth, load_N, float(place))) is not None]
     if slopes:

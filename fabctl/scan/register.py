@@ -19,13 +19,14 @@ from scipy.spatial import cKDTree
 
 from design.findings import Finding
 from fabctl.events import Emit, Event, silent
-from fabctl.scan.borders import circle
+from fabctl.scan.borders import circle, rim_axis, turn_motion
 from fabctl.scan.clean import Cleaned, Part
 from fabctl.scan.coarse import search, search_cloud
 from fabctl.scan.decide import HELD_FRAC, Datums, decide_by_border, decide_by_datums, decide_by_paint
+from fabctl.scan.edges import edge_finder
 from fabctl.scan.judge import Judged, judge, thin
 from fabctl.scan.paint import Paint
-from fabctl.scan.refine import Options, moved_by, refine, weak_motions
+from fabctl.scan.refine import Options, is_weak, moved_by, refine, weak_motions
 from fabctl.scan.rim import Rest
 from fabctl.scan.similarity import Similarity
 from fabctl.scan.symmetry import Symmetries, find_mirrors
@@ -45,7 +46,10 @@ LEAST_MEMBERS = 200
 MIRROR_BETTER_RATIO = 0.7
 MIRROR_DOUBT_FRAC = 0.005
 SAME_POSE_FRAC = 0.004
+FINAL_ROUNDS, SETTLED_FRAC = 3, 1e-4  # of the diagonal
 PUSHES_FRAC = (-0.04, -0.015, 0.015, 0.04)
+
+NO_SYMMETRIES = Symmetries((), None, None)
 
 Status = Literal["aligned", "symmetric", "ambiguous", "failed", "mirrored"]
 
@@ -151,8 +155,18 @@ def pushed(task: Task, body: Body, best: Judged) -> list[Judged]:
         for motion in weak
         for push in PUSHES_FRAC
     ]
-    turned = [start for motion in weak[:1] for start in circle(body.tree, best.pose, motion, task.target).likeliest()]
-    return near + [tried(task, body, start, "turned until the border fits") for start in turned]
+    return near + [tried(task, body, start, "turned until the border fits") for start in _turned(task, body, best)]
+
+
+def _turned(task: Task, body: Body, best: Judged) -> list[Similarity]:
+    """Return the pose turned about the rim's axis to where the rest of the border fits, if the surface allows it."""
+    axis = rim_axis(task.target)
+    if axis is None or task.symmetries.continuous:
+        return []
+    finder = edge_finder(body.dense, best.pose, task.target)
+    if finder is None or not is_weak(turn_motion(axis, task.target), best.fit, task.target, HELD_FRAC):
+        return []
+    return circle(body.tree, finder, best.pose, axis).likeliest()
 
 
 def register(task: Task) -> Registration:
@@ -205,7 +219,8 @@ def _decided(task: Task, body: Body, found: list[Judged]) -> Registration:
             others = tuple(j for j in (best, *turned, *rivals) if j.fit.patches is not painted.fit.patches)
             return _finished(task, "aligned", painted, others, body, "colour")
     if rivals and not turns:
-        single_out = decide_by_border(body.tree, [best, *rivals], task.target, task.options)
+        finder = edge_finder(body.dense, best.pose, task.target)
+        single_out = None if finder is None else decide_by_border(finder, body.tree, [best, *rivals], task.symmetries)
         if single_out is not None:
             others = tuple(j for j in (best, *rivals) if j is not single_out)
             return _finished(task, "aligned", single_out, others, body, "border")
@@ -267,10 +282,13 @@ def _finished(
 ) -> Registration:
     specimen = specimen_points(task, body.part, best.pose)
     if status in ("aligned", "symmetric") and specimen.sum() > 500:
-        chosen = task.points[specimen]
-        final = refine(chosen[:: max(1, len(chosen) // FINAL_POINTS)], best.pose, task.target, task.options)
-        best = replace(best, fit=final)
-        specimen = specimen_points(task, body.part, best.pose)
+        for _ in range(FINAL_ROUNDS):  # which points are the specimen hangs a little on the pose
+            chosen, before = task.points[specimen], best.pose
+            final = refine(chosen[:: max(1, len(chosen) // FINAL_POINTS)], before, task.target, task.options)
+            best = replace(best, fit=final)
+            specimen = specimen_points(task, body.part, best.pose)
+            if NO_SYMMETRIES.apart_frac(before, best.pose, task.target) < SETTLED_FRAC:
+                break
     findings = tuple(_findings(task, status, best, alternatives))
     return Registration(status, best, alternatives, body.part, specimen, task.symmetries, findings, decided_by)
 
@@ -285,15 +303,23 @@ def specimen_points(task: Task, part: Part, pose: Similarity) -> Mask:
     placed = pose(cells.centre[dense])
     found = target.closest(placed)
     near[dense] = np.linalg.norm(placed - found.points_mm, axis=1) < band_mm
-    if cleaned.table is not None and "plane kept" not in part.name:
-        near[dense] &= ~_too_low(found, pose, cleaned)
     held = np.zeros(len(task.points), dtype=bool)
     inside = cells.of_point >= 0
     held[inside] = (near & ((cleaned.cluster >= 0) | part.cells))[cells.of_point[inside]]
-    return held if "plane kept" in part.name else held & ~cleaned.is_table
+    if "plane kept" in part.name:
+        return held
+    held &= ~cleaned.is_table
+    if cleaned.table is not None:
+        low = np.zeros(len(cells.count), dtype=bool)
+        low[dense] = _too_low(found, pose, cleaned, room_cu=2 * cells.size_cu)
+        # A cell's middle lies where noise put it; which points are too low their own feet must say.
+        asked = np.flatnonzero(held)
+        asked = asked[low[cells.of_point[asked]]]
+        held[asked] = ~_too_low(target.closest(pose(task.points[asked])), pose, cleaned)
+    return held
 
 
-def _too_low(found: Closest, pose: Similarity, cleaned: Cleaned) -> Mask:
+def _too_low(found: Closest, pose: Similarity, cleaned: Cleaned, room_cu: float = 0.0) -> Mask:
     """Return where the target lies so near to the table that only points with upward noise were kept as specimen.
 
     There the scan would seem to deviate upwards. The more level the surface, the more of the noise is upwards.
@@ -302,7 +328,7 @@ def _too_low(found: Closest, pose: Similarity, cleaned: Cleaned) -> Mask:
     back = pose.inverse()
     height = cleaned.table.height(back(found.points_mm))
     level = np.abs((found.normals @ pose.rotation) @ cleaned.table.normal)
-    return np.asarray(height < cleaned.table_top_cu * (1 + 0.9 * level))
+    return np.asarray(height < cleaned.table_top_cu * (1 + 0.9 * level) + room_cu)
 
 
 def _findings(task: Task, status: Status, best: Judged, alternatives: tuple[Judged, ...]) -> Iterator[Finding]:

@@ -7,18 +7,17 @@ any height can be looked at. Marks are used by their centres, which neither ink 
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from design.findings import Finding, errors
 from fabctl.errors import RefusedError, UsageError
+from fabctl.files import json_of, why_not
 from fabctl.records.folder import as_json, write_atomically
 from fabctl.vision.boards import MarkSheet
 from fabctl.vision.lens import Lens, lens_from
@@ -275,8 +274,10 @@ def write_alignment(alignment: Alignment, path: Path) -> None:
 
 def read_alignment(path: Path) -> Alignment:
     """Return the alignment in the file; raise `UsageError` where there is none."""
+    if not path.exists():
+        raise UsageError(f"{path}: the bed is not aligned yet; run `fabctl camera align`")
+    data = json_of(path, "an alignment of `fabctl camera align`")
     try:
-        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if data["format"] != FORMAT:
             raise UsageError(f"{path}: alignment format {data['format']}, this tool reads {FORMAT}; align again")
         height_mm, rms_mm, worst_mm = (float(data[key]) for key in ("height_mm", "rms_mm", "worst_mm"))
@@ -293,7 +294,5 @@ def read_alignment(path: Path) -> Alignment:
             str(data["made_utc"]),
             str(data["marks"]),
         )
-    except FileNotFoundError:
-        raise UsageError(f"{path}: the bed is not aligned yet; run `fabctl camera align`") from None
-    except (OSError, KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{path}: not an alignment: {fault}; run `fabctl camera align`") from fault
+    except (KeyError, TypeError, ValueError) as fault:
+        raise UsageError(f"{path}: not an alignment: {why_not(fault)}; run `fabctl camera align`") from fault

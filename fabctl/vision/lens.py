@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from design.findings import Finding, errors
 from fabctl.errors import RefusedError, UsageError
+from fabctl.files import json_of, why_not
 from fabctl.records.folder import as_json, write_atomically
 from fabctl.vision.boards import Charuco
 from fabctl.vision.markers import FAMILIES
@@ -266,14 +266,9 @@ def lens_from(data: dict[str, Any], where: str) -> Lens:
         made, board = str(data["made_utc"]), str(data["board"])
         return Lens((int(w), int(h)), K, distortion, rms_px, repeat_px, coverage, int(data["views_count"]), made, board)
     except (KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{where}: not a lens file: {fault}") from fault
+        raise UsageError(f"{where}: not a lens file: {why_not(fault)}") from fault
 
 
 def read_lens(path: Path) -> Lens:
     """Return the lens in the file."""
-    try:
-        return lens_from(json.loads(path.read_text(encoding="utf-8")), str(path))
-    except OSError as fault:
-        raise UsageError(f"{path}: {fault.strerror}; measure the lens with `fabctl camera calibrate`") from fault
-    except ValueError as fault:
-        raise UsageError(f"{path}: not JSON: {fault}") from fault
+    return lens_from(json_of(path, "a lens of `fabctl camera calibrate`"), str(path))

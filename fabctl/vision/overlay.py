@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,5 +174,6 @@ def write_picture(path: str, picture: Picture) -> None:
     """Write a picture; raise `OSError` where it cannot be written."""
     import cv2
 
-    if not cv2.imwrite(path, picture):
-        raise OSError(f"{path}: the picture cannot be written")
+    good, data = cv2.imencode(Path(path).suffix, picture)
+    assert good, f"{path}: a picture of shape {picture.shape} does not become bytes"
+    Path(path).write_bytes(data.tobytes())

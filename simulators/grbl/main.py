@@ -21,8 +21,9 @@ from simulators.grbl.settings import Memory
 LONGEST_WAIT_S = 0.02
 SHORTEST_WAIT_S = 0.0008  # nine bytes of a fast line: looking at each by itself would cost more than all the rest
 Trace = Callable[[Point], None]
-# A laser as a lab has it: 300 × 200 mm, homing at the far corner, laser mode on.
+# A laser as a lab has it: 300 × 200 mm, homing at the far corner, laser mode on, motors that never let go.
 LAB: dict[int, float] = {
+    1: 255,
     22: 1,
     20: 1,
     32: 1,

@@ -15,7 +15,7 @@ from benchmarks._laser_dialogues import recorded_job
 from drivers.grbl.messages import Report
 from drivers.grbl.settings import Identity, Settings
 from fabctl.config.bench import LaserConfig
-from fabctl.config.material import LaserPreset, LayerConfig, MaterialConfig
+from fabctl.config.material import LaserPreset, LayerConfig, MaterialConfig, load_material
 from fabctl.cut import job
 from fabctl.cut.estimate import Dynamics, estimate
 from fabctl.cut.place import Affine, lay, read_affine, travel_box_mm
@@ -198,6 +198,21 @@ def test_long_cuts_are_divided_and_stay_the_same_cut() -> None:
     assert longest_s <= 1.001
     assert sum(step.length_mm for step in divided.steps if step.burns) == pytest.approx(100)
     assert divided.steps[-1].beam == 5
+
+
+@pytest.mark.parametrize("name", ["PVC-film", "soft vinyl", "neoprene-3", "polychloroprene", "Hypalon", "cr-60", "CSM"])
+def test_chlorine_is_known_by_its_names_too(name: str) -> None:
+    assert codes(material=RUBBER.model_copy(update={"name": name})) == {"CUT-MATERIAL-DANGER"}
+
+
+@pytest.mark.parametrize("name", ["acrylic-3", "natural-rubber-2.3", "chlorine-free foam", "latex", "EPDM", "eva-foam"])
+def test_harmless_names_are_not_taken_for_chlorine(name: str) -> None:
+    assert codes(material=RUBBER.model_copy(update={"name": name})) == set()
+
+
+@pytest.mark.parametrize("name", ["neoprene-2.0", "pvc-0.5"])
+def test_the_dangerous_materials_of_the_shelf_are_refused(name: str) -> None:
+    assert "CUT-MATERIAL-DANGER" in codes(material=load_material(name, Path("nowhere")))
 
 
 def test_a_single_move_takes_the_time_of_its_trapezoid() -> None:

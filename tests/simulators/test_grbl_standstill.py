@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks._laser_dialogues import alike, board_time, replay, rows_of
-from simulators.grbl.board import Board
+from simulators.grbl.board import Board, Point
 from simulators.grbl.machine import State
 from tests.simulators.test_grbl_board import board, say
 
@@ -43,6 +43,17 @@ def test_a_hold_is_complete_only_after_the_lock() -> None:
     assert say(b, b"?", 0.010) == ""
     assert say(b, b"~?", 0.1).startswith("<Hold:1|")  # the resume came too early, and is lost
     assert say(b, b"?", 0.02).startswith("<Hold:0|")
+
+
+@pytest.mark.parametrize(("mode", "lock", "measured_s"), [("M4", 25, 0.080), ("M4", 255, 0.080), ("M3", 255, 0.092)])
+def test_a_hold_is_dark_when_the_real_board_was(mode: str, lock: int, measured_s: float) -> None:
+    trace: list[Point] = []
+    b = board(trace, _1=lock)
+    say(b, f"{mode}S500\nG1X100F1500\n".encode(), 1.0)
+    began_s = b.machine.now_s
+    say(b, b"!", 0.3)
+    dark_s = next(p.t_s for p in trace if p.t_s > began_s and p.power_frac == 0) - began_s
+    assert dark_s == pytest.approx(measured_s, abs=0.010)  # a segment more or less
 
 
 def test_what_comes_while_a_reset_waits_is_kept_for_after_the_banner() -> None:

@@ -58,6 +58,7 @@ def test_the_floor_carries_the_whole_weight(standing) -> None:
     found = settle(layout, x, Sheet(), "slip")
     rim_heights = Floor(np.where(found.unloaded_mm[:, 2] < 60, found.unloaded_mm[:, 2], 0.0), 1.0)
     assert found.equilibrium.residual_ratio < 1e-8
+    assert found.smallest_eigenvalue_N_mm > 0
     assert found.standing_count >= 3
     assert rim_heights.energy(found.equilibrium.x_mm) > 0
 
@@ -67,6 +68,7 @@ def test_friction_obeys_its_limit(standing) -> None:
     rough, smooth = (settle(layout, x, Sheet(), "coulomb", friction_ratio=mu) for mu in (2.0, 0.2))
     assert smooth.slid_mm > rough.slid_mm
     assert rough.equilibrium.residual_ratio < 1e-8
+    assert rough.smallest_eigenvalue_N_mm > 0
 
 
 def test_a_weight_without_support_is_refused(standing) -> None:

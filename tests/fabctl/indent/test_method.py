@@ -12,7 +12,7 @@ from fabctl.config.loader import parse
 from fabctl.config.method import MethodConfig, load_method
 from fabctl.errors import ConfigError
 from fabctl.indent.method import Predicted, actions, check
-from fabctl.indent.run import resumed
+from fabctl.indent.resume import resumed
 
 RIG = RigConfig(url="x", map="reference", travel_mm=60.0, force_limit_N=20.0, indenter_radius_mm=8.0)
 NOWHERE = Path("nowhere")
@@ -59,6 +59,7 @@ def test_what_is_left_after_an_interruption_begins_with_a_tare() -> None:
     assert dome[0].kind == "tare"
     assert [a.curve for a in dome if a.kind == "load"] == [4]
     assert resumed(plan, [(point, 1) for point in range(1, 10)]) == ()
+    assert {a.point for a in resumed(plan, [(1, 1)], untouched=[2, 5])} == {3, 4, 6, 7, 8, 9}
 
 
 def test_a_load_without_an_approach_is_refused() -> None:
