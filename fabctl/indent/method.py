@@ -89,7 +89,8 @@ def _expanded(step: Simple) -> Iterator[Action]:
     elif isinstance(step, Unload):
         yield Action("unload", step.speed_mm_s, step.depth_mm, step.force_N, curve=-2)
     elif isinstance(step, Hold):
-        yield Action("hold", time_s=step.time_s, curve=-2)
+        speed = step.speed_mm_s if step.force_N is not None else 0.0
+        yield Action("hold", speed, force_N=step.force_N, time_s=step.time_s, curve=-2)
     elif isinstance(step, Wait):
         yield Action("wait", message=step.message)
     else:
@@ -108,10 +109,12 @@ def _cycles(step: Cycles) -> Iterator[Action]:
 
 def _numbered(found: Sequence[Action]) -> list[Action]:
     """Number the curves: every loading begins one, what belongs to it follows."""
-    numbered, curve = [], 0
+    numbered: list[Action] = []
+    curve = 0
     for action in found:
         curve += action.curve == -1
-        numbered.append(replace(action, curve=curve if action.curve else 0))
+        rests = action.kind == "hold" and bool(numbered) and numbered[-1].kind == "unload"
+        numbered.append(replace(action, curve=curve if action.curve and not rests else 0))
     return numbered
 
 
@@ -275,6 +278,9 @@ def _order(plan: Sequence[Action]) -> Iterator[Finding]:
         if action.kind == "tare" and touching:
             text = "a tare while the specimen is pressed would take its force for zero"
             yield Finding("METHOD-TARE-PRESSED", text, where=where, hint="unload before it")
+        if action.kind == "hold" and action.force_N is not None and not touching:
+            text = f"{action.force_N:g} N are to be held where nothing is pressed"
+            yield Finding("METHOD-HOLD", text, where=where, hint="load to that force before it")
         touching = _touches(action, touching)
         if action.kind == "load" and pressed:
             text = "this curve begins under a preload: without a zero after it nothing can be counted from contact"

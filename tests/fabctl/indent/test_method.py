@@ -27,7 +27,7 @@ def codes(found: MethodConfig, predicted: Predicted | None = None, has_stage: bo
     return {finding.code for finding in check(actions(found), found, RIG, predicted, has_stage)}
 
 
-@pytest.mark.parametrize("name", ["dome", "quick", "grid", "creep", "cap"])
+@pytest.mark.parametrize("name", ["dome", "quick", "grid", "creep", "relaxation", "cap"])
 def test_the_shipped_methods_pass_their_own_check(name: str) -> None:
     found = load_method(name, NOWHERE)
     assert codes(found) == {"METHOD-NO-PREDICTION"}
@@ -85,6 +85,18 @@ def test_a_tare_while_the_specimen_is_pressed_is_refused() -> None:
     for way_out, refused in (("", True), ("force_N: 0.1, ", True), (None, False)):
         unload = "" if way_out == "" else f"  - {{step: unload, {way_out or ''}speed_mm_s: 1}}\n"
         assert ("METHOD-TARE-PRESSED" in codes(method(begin + load + unload + tare))) == refused
+
+
+def test_a_rest_after_the_way_out_belongs_to_no_curve() -> None:
+    found = actions(load_method("relaxation", NOWHERE))
+    assert [(a.time_s, a.curve) for a in found if a.kind == "hold"] == [(60.0, 1), (10.0, 0)]
+
+
+def test_a_force_cannot_be_held_where_nothing_is_pressed() -> None:
+    begin = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"
+    hold = "  - {step: hold, time_s: 5, force_N: 0.5}\n"
+    assert "METHOD-HOLD" in codes(method(begin + hold))
+    assert "METHOD-HOLD" not in codes(method(begin + "  - {step: load, force_N: 0.5, speed_mm_s: 1}\n" + hold))
 
 
 def test_a_predicted_force_above_the_limit_is_refused() -> None:
