@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from design.deploy.compare import kabsch
-from design.deploy.equilibrium import from_flat, pushed_flat, solve_level
+from design.deploy.equilibrium import from_flat, pushed_flat, rolled, solve_level
 from design.deploy.levels import Layout
 from design.deploy.newton import Equilibrium
 from design.deploy.shell import Ints, Reals, neighbours
@@ -31,7 +31,12 @@ class Found:
 
 
 def starts(layout: Layout, count: int, seed: int) -> dict[str, Callable[[Layout], Reals]]:
-    """Return named starts: up, down, and `count` random gentle bulges of the flat sheet, repeatable by `seed`."""
+    """Return named starts: up, down, and `count` random gentle bulges of the flat sheet, repeatable by `seed`.
+
+    A sheet with a re-joined seam starts as a cylinder, either side out.
+    """
+    if layout.rejoined_count():
+        return {"rolled": rolled, "rolled inside out": functools.partial(rolled, outward=-1.0)}
     named: dict[str, Callable[[Layout], Reals]] = {
         "up": lambda level: pushed_flat(level, 0.3),
         "down": lambda level: pushed_flat(level, -0.3),

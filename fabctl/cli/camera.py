@@ -113,7 +113,7 @@ def _write_board(made: Charuco | MarkSheet, as_json: bool) -> None:
     strokes = [] if isinstance(made, Charuco) else hatch(sheet_ink(made), 0.1, 0.1)
     files = {kind: folder / f"{made.name}.{kind}" for kind in ("yaml", "pdf", "dxf")}
     write_board(config_of(made), files["yaml"])
-    files["pdf"].write_bytes(pdf(drawing))
+    write_atomically(files["pdf"], pdf(drawing))
     write_atomically(files["dxf"], dxf(drawing, strokes))
     w, h = made.size_mm
     lines = [f"{path}" for path in files.values()]

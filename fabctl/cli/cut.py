@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
 from fabctl.cli.cut_camera import marks_command
 from fabctl.cli.cut_inspect import inspect_command
 from fabctl.cli.paths import RUN, InFile, InFolder, config_names
@@ -69,7 +69,10 @@ def run(
     yes: bool,
     as_json: bool,
 ) -> None:
-    """Cut the design in folder DESIGN: plan, check, one question, then cut; a run record either way."""
+    """Cut the design in folder DESIGN: plan, check, one question, then cut.
+
+    A run record is kept whatever comes of it, also of a refusal or a no; of a dry run none.
+    """
     from dataclasses import replace
 
     from fabctl.bench import open_bench
@@ -103,7 +106,7 @@ def run(
             order = replace(order, eye=eye_of(bench, marks, at_mm, chosen.thickness_mm, camera_file, image))
         desk = Desk(lambda question: confirm(question, yes), progress(), keys)
         if not dry_run:
-            say(HELP)
+            say_keys(HELP)
         if resume_run is not None:
             from fabctl.cut.resume import resume
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
 from fabctl.cli.paths import config_names
 
 if TYPE_CHECKING:
@@ -111,5 +111,5 @@ def plain_job(order: CutOrder, bench_name: str, purpose: str, yes: bool, dry_run
     home = lab()
     with open_bench(home, load_bench(bench_name, home.root), purpose) as bench, keyboard() as keys:
         if not dry_run:
-            say(HELP)
+            say_keys(HELP)
         return cut(home, bench, order, Desk(lambda question: confirm(question, yes), progress(), keys), dry_run)

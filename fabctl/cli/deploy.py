@@ -170,7 +170,7 @@ def _cascade(laid: Laid, folder: Path, popped: Deployed, animation: bool, emit: 
     write_atomically(folder / "cascade.csv", cascade_csv(found))
     if animation:
         gif = animation_gif(followed(found.frames_mm, popped.mesh.vertices_mm), popped.mesh, "opened unit by unit")
-        (folder / "cascade.gif").write_bytes(gif)
+        write_atomically(folder / "cascade.gif", gif)
     end = replace(popped.equilibrium, x_mm=found.x_mm)
     off = compared(laid.layout, end, laid.target, laid.design_mm).deviation
     return {
@@ -219,10 +219,10 @@ def _write(
     shown = popped.mesh if settled is None else TriMesh(settled.equilibrium.x_mm, popped.mesh.faces)
     write_ply(folder / "deployed.ply", shown)
     title = "deployed" if settled is None else f"deployed, under its weight ({facts['support']})"
-    (folder / "deployed.png").write_bytes(picture_png(shown, laid.target, title))
+    write_atomically(folder / "deployed.png", picture_png(shown, laid.target, title))
     if animation:
         frames = deployment(laid.layout, popped.mesh.vertices_mm)
-        (folder / "deployment.gif").write_bytes(animation_gif(frames, popped.mesh, "deployment"))
+        write_atomically(folder / "deployment.gif", animation_gif(frames, popped.mesh, "deployment"))
     write_atomically(folder / "deploy.json", as_json(facts))
 
 

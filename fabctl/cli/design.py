@@ -100,6 +100,7 @@ def check(
     from design.checking import misfit_png
     from fabctl.designing import inputs_for
     from fabctl.errors import DONE, REFUSED
+    from fabctl.records.folder import write_atomically
 
     listen = progress()
     inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
@@ -109,7 +110,7 @@ def check(
 
     found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, remedy, watch)
     if picture is not None:
-        picture.write_bytes(misfit_png(inputs.mesh, found.report, inputs.spec.name))
+        write_atomically(picture, misfit_png(inputs.mesh, found.report, inputs.spec.name))
     findings = [*inputs.findings, *found.findings]
     for finding in findings:
         say(str(finding))

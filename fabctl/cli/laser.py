@@ -231,7 +231,9 @@ def testgrid(
     width, height = size_mm(grid)
     facts = {"width_mm": width, "height_mm": height, "cells_count": len(grid.powers_frac) * len(grid.feeds_mm_s)}
     if out:
-        out.write_text("\n".join(grid_lines(grid, 1000.0)) + "\n", encoding="ascii")
+        from fabctl.records.folder import write_atomically
+
+        write_atomically(out, "\n".join(grid_lines(grid, 1000.0)) + "\n")
         show({**facts, "file": str(out)}, as_json, [f"{out}: {width:g} × {height:g} mm, for $30=1000"])
         return
     from fabctl.cut.by_hand import run_here

@@ -137,7 +137,7 @@ def run_test(
     with contextlib.closing(open_indenter(bench.url("rig"), plan.registers)) as rig:
         identity = rig.identify()
         _refuse_rig(plan, identity)
-        config = _config(plan, identity, rig.environment())
+        config = _config(plan, identity, rig.environment(), bench.config.is_simulated)
         inputs = [plan.method_path, plan.map_path]
         inputs += [p for p in (plan.specimen.design / "response.csv",) if p.is_file()]
         run = start_run(lab.runs, "indent", specimen=plan.specimen.name, inputs=inputs, config=config)
@@ -286,12 +286,13 @@ def _refuse_rig(plan: IndentPlan, identity: Identity) -> None:
         raise RefusedError(f"{identity.model} cannot run method {plan.method.name}", found)
 
 
-def _config(plan: IndentPlan, identity: Identity, air: Mapping[str, float]) -> dict[str, Any]:
+def _config(plan: IndentPlan, identity: Identity, air: Mapping[str, float], simulated: bool) -> dict[str, Any]:
     """Return what is frozen into the run: method, plan, rig, calibration, and the conditions."""
     return {
         "method": plan.method.model_dump(mode="json"),
         "plan": [asdict(action) for action in plan.actions],
         "rig": {**asdict(identity), "map": plan.registers.name, "indenter_radius_mm": plan.rig.indenter_radius_mm},
+        "simulated": simulated,
         "sample_hz": plan.sample_hz,
         "calibration": plan.calibration.as_dict() if plan.calibration is not None else None,
         "conditions": {**air, **plan.conditions},
