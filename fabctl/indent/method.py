@@ -226,8 +226,9 @@ def check(
     deepest = max((a.depth_mm for a in plan if a.kind == "load" and a.depth_mm is not None), default=None)
     if predicted is None:
         found.append(Finding("METHOD-NO-PREDICTION", "no predicted response to check the method against", "warning"))
-    elif deepest is not None:
-        found += _against(predicted, deepest, method, rig)
+    else:
+        found += _out_of_reach(plan, predicted)
+        found += _against(predicted, deepest, method, rig) if deepest is not None else ()
     return found
 
 
@@ -256,6 +257,20 @@ def _against(predicted: Predicted, deepest_mm: float, method: MethodConfig, rig:
             f"predicted for a sphere of {radius:g} mm, on the rig is one of {rig.indenter_radius_mm:g} mm",
             "warning",
         )
+
+
+def _out_of_reach(plan: Sequence[Action], predicted: Predicted) -> Iterator[Finding]:
+    """Say which forces the specimen is predicted never to answer with: the stage would go on to its travel's end."""
+    most_N = float(predicted.load_N.max())
+    for kind, force_N in sorted({(a.kind, a.force_N) for a in plan if a.force_N is not None and a.kind != "unload"}):
+        if force_N > most_N:
+            yield Finding(
+                "METHOD-OUT-OF-REACH",
+                f"{kind} to {force_N:g} N: down to {predicted.depth_mm[-1]:g} mm the specimen is predicted to answer "
+                f"with {most_N:.3g} N at most",
+                "warning",
+                hint="a smaller force, or a depth instead",
+            )
 
 
 def _order(plan: Sequence[Action]) -> Iterator[Finding]:

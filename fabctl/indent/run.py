@@ -56,14 +56,17 @@ def left_behind(now: Sample, safe_height_mm: float) -> list[Finding]:
     A tare taken on a pressed specimen would make every figure wrong, and the approach would press on from there.
     """
     found = []
-    latched = [fault for fault in now.faults if fault not in HARMLESS]
-    if latched:
+    if latched := _latched(now):
         hint = "look at the specimen, then `fabctl rig clear` and `fabctl rig retract`"
         found.append(Finding("RIG-LATCHED", f"the controller still holds {', '.join(latched)}", hint=hint))
     if "unhomed" not in now.faults and now.position_mm > safe_height_mm + STANDING_MM:
         text = f"the indenter stands at {now.position_mm:.2f} mm, safe is {safe_height_mm:g} mm"
         found.append(Finding("RIG-DOWN", text, hint="look at the specimen, then `fabctl rig retract`"))
     return found
+
+
+def _latched(now: Sample) -> list[str]:
+    return [fault for fault in now.faults if fault not in HARMLESS]
 
 
 @dataclass
@@ -167,7 +170,8 @@ class Runner:
             self._do(action)
         except NoContact as fault:
             now = self.sampler.fresh()
-            if not action.point or now.faults or now.force_N - self.sampler.tare_N >= fault.trigger_N:
+            touches = now.force_N - self.sampler.tare_N >= fault.trigger_N
+            if not action.point or _latched(now) or touches:
                 raise
             self.ending.no_contact[action.point] = str(fault)
             self.emit(Event("no_contact", f"point {action.point}: {fault}", data={"point": action.point}))

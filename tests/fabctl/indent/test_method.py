@@ -104,6 +104,15 @@ def test_a_predicted_force_above_the_limit_is_refused() -> None:
     assert "METHOD-PREDICTED-FORCE" in codes(load_method("dome", NOWHERE), stiff)
 
 
+def test_a_force_that_the_specimen_is_predicted_never_to_reach_is_told() -> None:
+    soft = Predicted(np.linspace(0, 10, 11), np.linspace(0, 0.02, 11))
+    assert "METHOD-OUT-OF-REACH" not in codes(load_method("creep", NOWHERE), soft)
+    softer = Predicted(np.linspace(0, 10, 11), np.linspace(0, 0.01, 11))
+    plan = load_method("creep", NOWHERE)
+    told = [f.message for f in check(actions(plan), plan, RIG, softer) if f.code == "METHOD-OUT-OF-REACH"]
+    assert [text.split(":")[0] for text in told] == ["hold to 0.012 N", "load to 0.012 N"]
+
+
 def test_a_snap_in_the_prediction_counts_with_its_peak() -> None:
     snapping = Predicted(np.array([0.0, 1.0, 5.0]), np.array([0.0, 6.0, 0.1]))
     assert "METHOD-PREDICTED-FORCE" in codes(load_method("dome", NOWHERE), snapping)
