@@ -12,10 +12,11 @@ from design.cells.bending_map import load_bending
 from design.cells.library import load_library
 from design.cells.select import SelectionOptions, on_curve, selection_curve
 from design.cells.sheet import Sheet
+from design.deploy.compare import surface_samples
 from design.deploy.designed import designed_layout, lift
 from design.deploy.levels import Layout, sheet_layout
-from design.flatten import flatten
-from design.meshfiles import read_mesh
+from design.flatten import Flattening, flatten
+from design.meshfiles import read_corner_uv, read_mesh
 from design.pattern.assign import averaged
 from design.pattern.tiling import tile
 from design.pipeline import scaled_tube
@@ -58,18 +59,61 @@ def cap(apex: float, edge_mm: float, D_mJ: float | None = None) -> tuple[Layout,
     return layout, goal
 
 
+def sphere_deviation_mm(x: Reals, layout: Layout) -> tuple[float, Reals]:
+    """Return the mean distance of the units from the sphere fitted with its own radius, and the shape about it."""
+    from scipy.optimize import least_squares
+
+    points, area = surface_samples(x, layout.cells)
+
+    def gap(centre: Reals) -> Reals:
+        return np.asarray((np.linalg.norm(points - centre, axis=1) - CAP_MM) * np.sqrt(area))
+
+    centre = least_squares(gap, x.mean(axis=0) - [0, 0, 60]).x
+    return float(np.average(np.abs(np.linalg.norm(points - centre, axis=1) - CAP_MM), weights=area)), x - centre
+
+
+def sphere_rms_mm(x: Reals, layout: Layout, aligned: bool) -> float:
+    """Return the RMS distance of the vertices from the target's sphere, about its own centre or the best one."""
+    about = sphere_deviation_mm(x, layout)[1] if aligned else x
+    return float(np.sqrt(np.mean((np.linalg.norm(about, axis=1) - CAP_MM) ** 2)))
+
+
+def shared_folder() -> Path:
+    """Return where the published data are, if they are here."""
+    return Path(os.environ.get("FABCTL_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+
+
 def published(name: str) -> TriMesh | None:
     """Return a published target, None where it is not here."""
-    root = Path(os.environ.get("FABCTL_SHARED", Path(__file__).resolve().parents[2] / "shared"))
-    path = root / "published" / "targets" / f"{name}.obj"
+    path = shared_folder() / "published" / "targets" / f"{name}.obj"
     return read_mesh(path)[0] if path.is_file() else None
 
 
-def tiled(mesh: TriMesh, count: int | None, D_mJ: float | None) -> tuple[Layout, Reals]:
-    """Return a target's layout of about `count` units (None: 10 mm cells) and where its vertices belong."""
+def published_lie_rad(name: str, flat: Flattening) -> float:
+    """Return how far the published flat of a target is turned against ours: units have their sides along its x.
+
+    The two flats are the same shape; least squares over the points that lie at the same place in space.
+    """
+    from scipy.spatial import cKDTree
+
+    corners, uv = read_corner_uv(shared_folder() / "published" / "targets" / f"{name}_flat.obj")
+    _, same = cKDTree(flat.mesh.vertices_mm).query(corners.reshape(-1, 3))
+    ours, theirs = (p - p.mean(axis=0) for p in (flat.flat_mm[same], uv.reshape(-1, 2)))
+    return float(np.angle(np.vdot(ours @ [1, 1j], theirs @ [1, 1j])))
+
+
+def tiled(
+    mesh: TriMesh, count: int | None, D_mJ: float | None, name: str | None = None, turn_rad: float = 0.0
+) -> tuple[Layout, Reals]:
+    """Return a target's layout of about `count` units (None: 10 mm cells) and where its vertices belong.
+
+    The flat lies as its published one, where `name` is given, and is turned by `turn_rad` from there.
+    """
     flat = flatten(mesh)
     scale = 1.75 / float(np.quantile(flat.expansion_ratio, 0.99))
-    expansion, points = flat.expansion_ratio * scale, flat.flat_mm / scale
+    turn = turn_rad + (published_lie_rad(name, flat) if name else 0.0)
+    turning = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    expansion, points = flat.expansion_ratio * scale, flat.flat_mm @ turning / scale
     area = float(np.sum(mesh.face_areas_mm2() / expansion**2))
     edge = SHEET.edge_mm if count is None else float(np.sqrt(area / count / np.sqrt(0.1875)))
     cells = tile(points, flat.faces, edge)

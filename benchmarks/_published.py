@@ -33,12 +33,7 @@ def table(path: Path) -> Any:
 
 def half_map(shared: Path) -> PublishedMap:
     """Return the published half map, for cells of 10 mm."""
-    return map_of(shared / "published" / "cell_library_half.csv")
-
-
-def map_of(path: Path) -> PublishedMap:
-    """Return a published map, half or whole, for cells of 10 mm."""
-    rows = table(path)
+    rows = table(shared / "published" / "cell_library_half.csv")
     return PublishedMap(
         t_mm=10 * rows["t_over_l0"],
         theta_rad=rows["theta_rad"],

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from benchmarks import Figure
 from design.cells import compare as comparing
 from design.cells import homogenise
-from design.cells.homogenise import Failure, Pair
-from design.cells.library import CellLibrary, load_library
+from design.cells.homogenise import Failure
+from design.cells.library import load_library
 from design.cells.mesh import REFERENCE, Density, topology
 from design.cells.periodic import periodic_cell, positions, smallest_eigenvalues
 from design.cells.sheet import Sheet
@@ -67,10 +67,16 @@ def _library() -> Iterator[Figure]:
     name = "range of the shipped library, all bistable cells"
     yield Figure(f"{name}, low", low, "", "1.129 within 0.005", abs(low - 1.129) <= 0.005, len(library))
     yield Figure(f"{name}, high", high, "", "1.775 within 0.005", abs(high - 1.775) <= 0.005, len(library))
-    with_shallow = min(low, *_shallow_expansions(library))
-    yield Figure("  low end with the wells too shallow for the mesh", with_shallow, "", "told", None, len(library))
-    finer = _shallow_expansions(library, REFERENCE.refined(2), every=4)
-    yield Figure("  those wells at half the mesh size, least expansion", min(finer), "", "told", None, len(finer))
+    places = list(zip(*library.shallow_cells(), strict=True))
+    yield Figure("  shallow wells among them, decided at half the mesh size", len(places), "", "told", None, total)
+    for name, density, every in (
+        ("the reference mesh", REFERENCE, 1),
+        ("half the mesh size", REFERENCE.refined(2), 1),
+        ("a third", REFERENCE.refined(3), 4),
+        ("a quarter", REFERENCE.refined(4), 9),
+    ):
+        found = _expansions(places[::every], density)
+        yield Figure(f"  least expansion of those, {name}", min(found), "", "told", None, len(found))
     yield Figure("valid polygons decided", decided, "", "≥ 0.995", decided >= 0.995, valid)
     for verdict, count in counts.items():
         yield Figure(f"candidates {verdict}", count, "", "shown", None, total)
@@ -78,14 +84,10 @@ def _library() -> Iterator[Figure]:
         yield Figure(f"  because: {reason}", count, "", "shown", None, total)
 
 
-def _shallow_expansions(library: CellLibrary, density: Density = REFERENCE, every: int = 1) -> list[float]:
-    """Return the second states that the library leaves out because their barrier is too low to be told from none."""
-    expansions = []
-    for t_mm, theta in list(zip(*library.shallow_cells(), strict=True))[::every]:
-        found = homogenise.solve_pair(float(t_mm), float(theta), SHEET, density)
-        if not isinstance(found, Failure):
-            expansions.append(found[1].stable.s_ratio)
-    return expansions
+def _expansions(places: list[tuple[float, float]], density: Density) -> list[float]:
+    """Return the second states of those (t_mm, theta_rad) that have one on this mesh."""
+    pairs = (homogenise.solve_pair(float(t_mm), float(theta), SHEET, density) for t_mm, theta in places)
+    return [found[1].stable.s_ratio for found in pairs if not isinstance(found, Failure)]
 
 
 def _column(theta_rad: float, density: Density) -> tuple[list[float], list[float]]:
@@ -93,16 +95,13 @@ def _column(theta_rad: float, density: Density) -> tuple[list[float], list[float
     plan = plan_of(SHEET, density=density)
     bistable: list[float] = []
     other: list[float] = []
-    before: list[Pair] = []
+    trail = homogenise.Trail()
     for t_mm in column_t_mm(plan, theta_rad):
         begin = time.process_time()
-        guess = homogenise.predicted(*before) if len(before) == 2 else None
-        found = homogenise.solve_pair(float(t_mm), theta_rad, SHEET, density, guess)
-        if not isinstance(found, Failure):
-            homogenise.numbers(float(t_mm), theta_rad, *found)
+        found, mesh_ratio, trail = homogenise.walked(float(t_mm), theta_rad, SHEET, density, trail)
+        homogenise.cell_of(float(t_mm), theta_rad, found, mesh_ratio)
         spent_ms = 1e3 * (time.process_time() - begin)
         (other if isinstance(found, Failure) else bistable).append(spent_ms)
-        before = [] if isinstance(found, Failure) else [*before[-1:], found[1]]
     return bistable, other
 
 

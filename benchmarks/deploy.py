@@ -1,6 +1,6 @@
 """Figures of the deployed shape: `python -m benchmarks deploy [PART …]`.
 
-Parts: derivatives, forms, targets, vase, caps, gravity, compensation, time.
+Parts: derivatives, forms, targets, turned, vase, caps, gravity, compensation, time.
 
 The published targets are read from `$FABCTL_SHARED` or `shared` beside the project; without them those figures are left
 out and said to be.
@@ -25,6 +25,8 @@ from benchmarks._deploy_cases import (
     cap,
     properties,
     published,
+    sphere_deviation_mm,
+    sphere_rms_mm,
     tiled,
     tiled_vase,
     whole_vase,
@@ -33,13 +35,14 @@ from design.cells.library import load_library
 from design.deploy.compensate import Compensation, compensate
 from design.deploy.equilibrium import from_flat, rolled, solve_level
 from design.deploy.factor import factorise
-from design.deploy.indentation import Response, border, indentation_response
+from design.deploy.indentation import Response, indentation_response
 from design.deploy.levels import Layout
-from design.deploy.newton import System, pins, solve
+from design.deploy.newton import System, pins
 from design.deploy.predict import compared
 from design.deploy.search import equilibria
 from design.deploy.shell import Shell, build_shell
-from design.deploy.supports import settle, weight_of
+from design.deploy.standing import standing
+from design.deploy.supports import Support, settle
 from design.pattern.tiling import tile
 from design.surface import TriMesh
 
@@ -49,33 +52,19 @@ Reals = NDArray[np.float64]
 def measure(words: list[str]) -> list[Figure]:
     """Return the figures of the parts named, of all where none is."""
     parts: dict[str, Callable[[], list[Figure]]] = {
-        "derivatives": derivatives, "forms": closed_forms, "targets": solver_check, "vase": welded_vase,
-        "caps": two_caps, "gravity": gravity, "compensation": compensation, "time": times,
+        "derivatives": derivatives, "forms": closed_forms, "targets": solver_check,
+        "turned": turned_lattices, "vase": welded_vase, "caps": two_caps, "gravity": gravity,
+        "compensation": compensation, "time": times,
     }  # fmt: skip
     wanted = [word for word in words if not word.startswith("-")] or [
-        part for part in parts if part != "vase"
-    ]  # targets has it too
+        part for part in parts if part not in ("turned", "vase")
+    ]  # targets has them too
     return [figure for word in wanted for figure in parts[word]()]
 
 
 def most(name: str, value: float, limit: float, unit: str, target: str, n: int) -> Figure:
     """Return a figure that must not exceed its limit."""
     return Figure(name, round(float(value), 12), unit, target, bool(value <= limit), n)
-
-
-def sphere_deviation_mm(x: Reals, layout: Layout) -> tuple[float, Reals]:
-    """Return the mean distance of the units from the sphere fitted with its own radius, and the shape about it."""
-    from scipy.optimize import least_squares
-
-    from design.deploy.compare import surface_samples
-
-    points, area = surface_samples(x, layout.cells)
-
-    def gap(centre: Reals) -> Reals:
-        return np.asarray((np.linalg.norm(points - centre, axis=1) - CAP_MM) * np.sqrt(area))
-
-    centre = least_squares(gap, x.mean(axis=0) - [0, 0, 60]).x
-    return float(np.average(np.abs(np.linalg.norm(points - centre, axis=1) - CAP_MM), weights=area)), x - centre
 
 
 def derivatives() -> list[Figure]:
@@ -199,9 +188,23 @@ def solver_check() -> list[Figure]:
             figures.append(Figure(target, "published target not here", "", f"≤ {limit} %", None, 0))
             continue
         for name, D, asked in (("prescribed D", PRESCRIBED_MJ, limit), ("computed D, 10 mm cells", None, None)):
-            layout, goal = tiled(mesh, 920 if D else None, D)
+            layout, goal = tiled(mesh, 920 if D else None, D, target)
             figures += _every_shape(f"{target}, {name}", layout, goal, mesh, asked)
-    return [*figures, *welded_vase()]
+    return [*figures, *turned_lattices(), *welded_vase()]
+
+
+def turned_lattices() -> list[Figure]:
+    """Return how much the lilium's closest shape hangs on the way its units lie: the flat turned under the lattice."""
+    mesh = published("lilium_tower")
+    if mesh is None:
+        return []
+    percents = []
+    for turn_deg in range(0, 60, 10):
+        layout, goal = tiled(mesh, 920, PRESCRIBED_MJ, "lilium_tower", np.deg2rad(turn_deg))
+        shapes, _ = equilibria(layout, goal, 0)
+        percents.append(min(100 * compared(layout, s.equilibrium, mesh, goal).deviation.mean_frac for s in shapes))
+    told = ", ".join(f"{p:.2f}" for p in percents)
+    return [Figure("lilium_tower, its flat turned by 0, 10, … 50°: the closest", told, "%", "reported", None, 6)]
 
 
 def welded_vase(count: int = 3400) -> list[Figure]:
@@ -337,13 +340,15 @@ def compensation() -> list[Figure]:
         found = compensate(layout, goal, bounds)
         after = compared(found.layout, found.equilibrium, mesh, goal).deviation
         figures += _gains("double_dome", found, before.rms_mm, after.rms_mm)
-    layout, goal = cap(1.6, 10.0)
-    loads = [weight_of(layout, SHEET)]
-    rim = np.repeat(border(layout.cells, layout.vertex_count)[:, None], 3, axis=1)
-    heavy = solve(System(layout.shell()), goal, loads, rim)
-    found = compensate(layout, goal, bounds, loads=loads, fixed=rim)
-    rms = [float(np.sqrt(np.mean((np.linalg.norm(e.x_mm, axis=1) - CAP_MM) ** 2))) for e in (heavy, found.equilibrium)]
-    return [*figures, *_gains("heavy cap, rim held at its place", found, *rms)]
+    supports: tuple[Support, ...] = ("held", "no-slip")
+    for support in supports:
+        layout, goal = cap(1.6, 10.0)
+        held = standing(layout, goal, SHEET, support)
+        heavy = solve_level(layout, goal, held.loads, held.fixed)
+        found = compensate(layout, goal, bounds, standing=held)
+        rms = [sphere_rms_mm(e.x_mm, layout, held.aligned) for e in (heavy, found.equilibrium)]
+        figures += _gains(f"heavy cap, rim {support}", found, *rms)
+    return figures
 
 
 def _gains(name: str, found: Compensation, before_mm: float, after_mm: float) -> list[Figure]:
@@ -359,22 +364,23 @@ def _gains(name: str, found: Compensation, before_mm: float, after_mm: float) ->
 
 
 def times() -> list[Figure]:
-    """Return CPU seconds from flat (one thread, SciPy alone), compiled code warm."""
+    """Return seconds from flat with SciPy alone, compiled code warm: by the clock, and processor time."""
     figures = []
     from_flat(cap(1.505, 10.0, PRESCRIBED_MJ)[0])
     seconds, counts = [], []
     for edge, limit in ((5.2, 2.0), (1.645, 10.0), (1.163, 25.0)):
         layout, _ = cap(1.505, edge, PRESCRIBED_MJ)
-        begin = time.process_time()
+        begin, worked = time.perf_counter(), time.process_time()
         found = from_flat(layout)
-        seconds.append(time.process_time() - begin)
+        seconds.append(time.perf_counter() - begin)
         counts.append(len(layout.cells))
-        figures.append(
-            most(f"from flat, {len(layout.cells)} units ({found.iterations_count} iterations)", seconds[-1], limit,
-                 "s CPU", f"≤ {limit:g} s", len(layout.cells))
-        )  # fmt: skip
+        name = f"from flat, {counts[-1]} units ({found.iterations_count} iterations)"
+        figures += [
+            most(name, seconds[-1], limit / 2, "s", f"≤ {limit:g} s, half of it with the optional solver", counts[-1]),
+            Figure(f"{name}: processor time", round(time.process_time() - worked, 3), "s", "", None, counts[-1]),
+        ]
     rate = float(np.polyfit(np.log(counts), np.log(seconds), 1)[0])
     return [
         *figures,
-        Figure("growth exponent", round(rate, 2), "", "growth near linear", bool(rate < 1.4), len(counts)),
+        Figure("growth exponent", round(rate, 2), "", "growth near linear", bool(rate < 1.2), len(counts)),
     ]

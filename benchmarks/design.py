@@ -13,7 +13,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from benchmarks import Figure
-from benchmarks._published import SHEET_OFFSET_MM, PublishedMap, flat, half_map, map_of, table
+from benchmarks._published import SHEET_OFFSET_MM, PublishedMap, flat, half_map, table
 from design.cells.library import CellLibrary, load_library
 from design.cells.select import SelectionOptions, on_curve, select, selection_curve
 from design.pattern.assign import averaged
@@ -91,7 +91,7 @@ def published_figures(shared: Path, whole_map: Path | None = None) -> list[Figur
     """Return how the double dome's pattern comes out by the published rules."""
     points, faces, ratio = flat(shared, "double_dome")
     cells = table(shared / "published" / "double_dome_pattern_cells.csv")
-    library = half_map(shared) if whole_map is None else map_of(whole_map)
+    library = load_library(whole_map or shared / "published" / "cell_library_half.csv")
     tiling = tile(points, faces, 10.0)
     places = cKDTree(np.column_stack([cells["cx_mm"], cells["cy_mm"]]))
     row = places.query(tiling.centres_mm() + SHEET_OFFSET_MM)[1]

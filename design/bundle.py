@@ -24,7 +24,7 @@ import numpy as np
 
 from design.coupon import CELLS, Coupon, coupon_facts, coupon_texts
 from design.deploy.indentation import response_csv
-from design.errors import BundleError
+from design.errors import BundleError, NoBundle
 from design.export.dxf import dxf
 from design.export.svg import svg
 from design.findings import Finding
@@ -75,13 +75,8 @@ class Bundle:
 
 def open_bundle(path: Path) -> Bundle:
     """Return the design in a folder; raise `BundleError` with everything that is missing, edited or of another age."""
-    try:
-        manifest = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
-        files = dict(manifest["files"])
-    except FileNotFoundError:
-        raise BundleError(f"{path}: no design here (manifest.json is missing)") from None
-    except (OSError, ValueError, KeyError, TypeError) as fault:
-        raise BundleError(f"{path}: manifest.json cannot be read: {fault}") from fault
+    manifest = _manifest(path)
+    files: dict[str, Any] = manifest["files"]
     if manifest.get("format") != FORMAT:
         raise BundleError(f"{path}: a design of format {manifest.get('format')!r}; this program reads {FORMAT}")
     kind = str(manifest.get("kind", "design"))
@@ -94,6 +89,20 @@ def open_bundle(path: Path) -> Bundle:
     if faults:
         raise BundleError(f"{path}: not as it was built; build it again", faults)
     return Bundle(path, manifest)
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((path / "manifest.json").read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise NoBundle(f"{path}: no design here (manifest.json is missing)") from None
+    except OSError as fault:
+        raise NoBundle(f"{path}: manifest.json cannot be read: {(fault.strerror or 'unknown').lower()}") from fault
+    except (ValueError, RecursionError) as fault:
+        raise NoBundle(f"{path}: manifest.json is not JSON; build the design again") from fault
+    if not isinstance(found, dict) or not isinstance(found.get("files"), dict):
+        raise NoBundle(f"{path}: manifest.json is not that of a design; build the design again")
+    return found
 
 
 def _fault(path: Path, name: str, digest: str) -> Finding | None:
@@ -131,8 +140,7 @@ def write_coupon_bundle(
 
 
 def _write_whole(path: Path, replace: bool, about: Mapping[str, Any], fill: Callable[[Path], None]) -> Bundle:
-    if path.exists() and not _may_replace(path, replace):
-        raise BundleError(f"{path}: exists already; choose another folder, or say that a design there may be replaced")
+    refuse_taken(path, replace)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     draft.mkdir()
@@ -146,6 +154,12 @@ def _write_whole(path: Path, replace: bool, about: Mapping[str, Any], fill: Call
         shutil.rmtree(draft, ignore_errors=True)
         raise
     return open_bundle(path)
+
+
+def refuse_taken(path: Path, replace: bool = False) -> None:
+    """Raise `BundleError` where no design may be written into the folder; for asking before a long build."""
+    if path.exists() and not _may_replace(path, replace):
+        raise BundleError(f"{path}: exists already; choose another folder, or say that a design there may be replaced")
 
 
 def _may_replace(path: Path, replace: bool) -> bool:
@@ -236,11 +250,16 @@ def facts(design: Design) -> dict[str, Any]:
     if design.sheets:
         found["sheets_mm"] = [list(one.drawing.size_mm) for one in design.sheets]
     if design.predicted is not None:
-        deviation = design.predicted.deployed.deviation
+        deviation, rest = design.predicted.deployed.deviation, design.predicted.deployed.equilibrium
         found |= {
             "deviation_mean_mm": deviation.mean_mm,
             "deviation_max_mm": deviation.max_mm,
             "deviation_mean_frac": deviation.mean_frac,
+            "residual_ratio": rest.residual_ratio,
+            "iterations_count": rest.iterations_count,
+            "smallest_eigenvalue_N_mm": design.predicted.smallest_eigenvalue_N_mm,
+            "response_residual_ratio": design.predicted.response.residual_ratio,
+            "response_unstable_count": design.predicted.response.unstable_count,
             "stiffness_2mm_N_mm": design.predicted.response.stiffness_N_mm(2.0),
         }
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -54,6 +55,24 @@ def read_corner_uv(path: Path | str) -> tuple[Points, Points]:
         raise UnreadableMesh(f"{path}: no texture coordinates", [Finding("FILE-TEXTURE", "faces have no `vt` indices")])
     faces, texture_faces = np.array(soup.polygons), np.array(soup.texture_polygons)
     return soup.points[faces], soup.texture[texture_faces]
+
+
+def read_given_flat(path: Path | str, mesh: TriMesh) -> Points:
+    """Return the flat that an OBJ gives for `mesh`, which was read from it, by face corners `(m, 3, 2)`.
+
+    Raises `MeshError` where the file's faces are not those of the mesh: some were left out or divided.
+    """
+    try:
+        corners_mm, flat_mm = read_corner_uv(path)
+    except (ValueError, IndexError):  # polygons of several sizes, or corners without texture
+        corners_mm = flat_mm = np.zeros((0, 3, 3))
+    if corners_mm.shape[1:] != (3, 3) or len(corners_mm) != len(mesh.faces):
+        told = Finding("FILE-TEXTURE", "its texture coordinates are not one for every corner of its triangles")
+        raise MeshError(f"{path}: gives no flat of this surface", [told])
+    if np.abs(mesh.vertices_mm[mesh.faces] - corners_mm).max() > WELD_ratio * mesh.diagonal_mm():
+        told = Finding("FILE-TEXTURE", "its faces were put in another order when it was read")
+        raise MeshError(f"{path}: gives no flat of this surface", [told])
+    return flat_mm
 
 
 def _read_soup(path: Path) -> Soup:
@@ -168,10 +187,16 @@ def write_stl(path: Path | str, mesh: TriMesh) -> None:
 
 
 def write_mesh(path: Path | str, mesh: TriMesh) -> None:
-    """Write the mesh in the format its name asks for."""
+    """Write the mesh in the format its name asks for, whole or not at all."""
     writers: dict[str, Callable[[Path, TriMesh], None]] = {".ply": write_ply, ".obj": write_obj, ".stl": write_stl}
     path = Path(path)
     if path.suffix.lower() not in writers:
         text = f"meshes are OBJ, PLY or STL, not `{path.suffix}`"
         raise UnreadableMesh(f"{path}: {text}", [Finding("FILE-FORMAT", text)])
-    writers[path.suffix.lower()](path, mesh)
+    draft = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    try:
+        writers[path.suffix.lower()](draft, mesh)
+        draft.replace(path)
+    except OSError as fault:  # a full disk: what is there cannot be told from a mesh
+        draft.unlink(missing_ok=True)
+        raise OSError(fault.errno, fault.strerror, str(path)) from fault

@@ -15,11 +15,12 @@ from design.cells.monostable import monostable_cells
 from design.cells.select import Choice, SelectionCurve, on_curve, select, selection_curve
 from design.cells.sheet import Sheet
 from design.compensated import compensated
+from design.deploy.supports import Support
 from design.errors import OutOfLibrary
 from design.findings import Finding
 from design.flatten import Flattening, Limits, feasibility, flatten
 from design.flatten.ladder import Remedy
-from design.hinged import Widening, as_cut, hinged, widening
+from design.hinged import Widening, as_cut, hinge_range, hinged, widening
 from design.job import Job, JobOptions, compose_job
 from design.limits import check_count
 from design.pattern.assign import averaged, factor
@@ -111,12 +112,14 @@ def build(
     watch("flattening the surface", 0.0)
     found = list(findings)
     base, library, curve, wide = cells_on_offer(spec, library)
+    found += hinge_range(base, library)
     flat = lay_flat(spec, mesh, curve, found)
     watch("choosing cells", 0.2)
     flat, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)
     if spec.compensate:
         cut = np.array([kind == "cut" for kind in kinds_of(spec, tiling)])
-        wanted, choice = compensated(flat, tiling, wanted, choice, cut, library, curve, wide, found, watch)
+        rim: Support = "free" if spec.compensate is True else spec.compensate
+        wanted, choice = compensated(flat, tiling, wanted, choice, cut, library, curve, wide, found, watch, rim)
     hinge = hinges_mm(spec, choice, library)
     if curve is None and np.abs(hinge - base.sheet.hinge_mm).max() > HINGE_SAME_MM:
         choice, changed = as_cut(base, choice, hinge)
@@ -187,10 +190,10 @@ def lay_flat(spec: DesignSpec, mesh: TriMesh, curve: SelectionCurve | None, foun
     """Return the flat of `mesh`, by the first rung of the ladder on which the library's range is enough.
 
     Raises `OutOfLibrary` with what the ladder found where it ends before that. Cones that the specification asks for
-    are placed without climbing.
+    are placed without climbing, and a flat that is given is taken as it is.
     """
     remedy = {"report": "none"}.get(spec.infeasible, spec.infeasible)
-    if curve is None or spec.flatten.cones_count:
+    if curve is None or spec.flatten.cones_count or spec.flatten.given_mm is not None:
         flat = flatten(mesh, spec.flatten)
         found += flat.findings
         return flat

@@ -11,11 +11,13 @@ import shapely
 from numpy.typing import NDArray
 
 from design.cells.bending_map import bending_for
+from design.cells.contracting import is_contracting
 from design.cells.library import CellLibrary
 from design.cells.select import Choice
 from design.deploy.equilibrium import from_flat, pushed_flat
 from design.deploy.indentation import Response, indentation_response
 from design.deploy.levels import Layout, sheet_layout, weld
+from design.deploy.newton import System, smallest_eigenvalue_N_mm
 from design.deploy.predict import Deployed, deploy
 from design.deploy.search import same_shape
 from design.errors import NotConverged
@@ -25,6 +27,7 @@ from design.pattern.tiling import Array, Tiling
 from design.spec import ResponseOptions
 
 FROM_FLAT_COUNT = 2000  # units up to which the free deployment is computed too, in a second or so
+HINGE_RATIO, HINGE_FAR_RATIO = 0.04, 0.25  # a hinge further than that from the computed cells' is told, is a warning
 THICKNESS_RATIO = 0.05  # thickness over edge further than that from the computed cells' is told
 
 
@@ -35,6 +38,7 @@ class Predicted:
     deployed: Deployed
     response: Response
     findings: tuple[Finding, ...]
+    smallest_eigenvalue_N_mm: float  # of the deployed shape: how far it is from giving way
 
 
 def predict(
@@ -59,7 +63,9 @@ def predict(
         None if options.point_mm is None else np.array(options.point_mm),
         watch=lambda share: watch("pressing the indenter", 0.8 + 0.2 * share),
     )
-    return Predicted(deployed, response, (*_doubts(library), *_other_side(layout, deployed, tiling.twins is not None)))
+    softest = smallest_eigenvalue_N_mm(System(layout.shell()), deployed.equilibrium.x_mm, (), None)
+    doubts = (*_doubts(library), *_other_side(layout, deployed, tiling.twins is not None))
+    return Predicted(deployed, response, doubts, softest)
 
 
 def _other_side(layout: Layout, deployed: Deployed, is_tube: bool) -> list[Finding]:
@@ -99,18 +105,25 @@ def welded(layout: Layout, tiling: Tiling, design_mm: Array) -> tuple[Layout, Ar
 def _doubts(library: CellLibrary) -> list[Finding]:
     """Return what makes the prediction less sure."""
     computed, sheet = bending_for(library).sheet, library.sheet
+    found = []
     asked, known = sheet.thickness_mm / sheet.edge_mm, computed.thickness_mm / computed.edge_mm
-    if abs(asked / known - 1) < THICKNESS_RATIO:
-        return []
-    return [
-        Finding(
-            "DEPLOY-THICKNESS",
+    if abs(asked / known - 1) >= THICKNESS_RATIO:
+        text = (
             f"bending stiffness was computed for a thickness of {known:.3g} of the cell's edge; yours is {asked:.3g}, "
-            "and is scaled with the cube of the thickness",
-            "warning",
-            hint="shape and response are less sure; `scripts/build_bending.py` computes the map anew",
+            "and is scaled with the cube of the thickness"
         )
-    ]
+        hint = "shape and response are less sure; `scripts/build_bending.py` computes the map anew"
+        found.append(Finding("DEPLOY-THICKNESS", text, "warning", hint=hint))
+    mine, theirs = sheet.hinge_mm / sheet.edge_mm, computed.hinge_mm / computed.edge_mm
+    if not is_contracting(library) and abs(mine / theirs - 1) >= HINGE_RATIO:
+        far = abs(mine / theirs - 1) > HINGE_FAR_RATIO
+        off = "a quarter less at low expansions, a tenth more at high ones" if far else "a twentieth either way"
+        text = (
+            f"bending stiffness is that of hinges of {theirs * sheet.edge_mm:.3g} mm; with yours of about "
+            f"{sheet.hinge_mm:.3g} mm it may be up to {off}"
+        )
+        found.append(Finding("DEPLOY-HINGE", text, "warning" if far else "info", hint="take the response with care"))
+    return found
 
 
 def layout_of(tiling: Tiling, choice: Choice, cut: NDArray[np.bool_], library: CellLibrary) -> Layout:

@@ -14,6 +14,7 @@ from design.pattern.tiling import Placement
 from design.pattern.toolpath import ToolOptions
 
 Kind = Literal["expanding", "contracting"]
+Rim = Literal["held", "no-slip", "slip", "coulomb"]
 Infeasible = Literal["report", "cones", "nearest", "both"]
 
 
@@ -56,5 +57,5 @@ class DesignSpec:
     tool: ToolOptions = field(default_factory=ToolOptions)
     spread_mm: float = 0.0
     bed_mm: tuple[float, float] | None = None
-    compensate: bool = False  # change expansions so that the sheet at rest, bent, meets the target
+    compensate: bool | Rim = False  # change expansions so that the sheet at rest meets the target; a rim: under weight
     response: ResponseOptions | None = field(default_factory=ResponseOptions)

@@ -155,8 +155,7 @@ def _check_topology(mesh: TriMesh) -> list[Finding]:
     _, first, repeats = np.unique(directed, return_index=True, return_counts=True)
     twisted = np.setdiff1d(undirected[first[repeats > 1]], crowded)
     if len(twisted):
-        text = "edge(s) lie between faces that look to opposite sides (flipped faces)"
-        found.append(_fault("MESH-FLIPPED", text, twisted, "orient the faces alike", edges=count))
+        found.append(_twist(mesh, twisted))
     pieces = _component_count(mesh)
     if pieces > 1:
         hint = "keep one, or join them"
@@ -171,6 +170,38 @@ def _check_topology(mesh: TriMesh) -> list[Finding]:
     if not found:
         found += _check_genus(mesh, len(edges))
     return found
+
+
+def _twist(mesh: TriMesh, twisted: Indices) -> Finding:
+    """Return what is wrong at edges whose faces look to opposite sides: flipped ones, or a surface of one side."""
+    count = len(mesh.vertices_mm)
+    if _has_two_sides(mesh):
+        text = "edge(s) lie between faces that look to opposite sides (flipped faces)"
+        return _fault("MESH-FLIPPED", text, twisted, "orient the faces alike", edges=count)
+    text = "edge(s) lie between faces that look to opposite sides, and no turning of faces helps: it has one side only"
+    hint = "like a Moebius band: cut it across once, so that it is a strip with two sides"
+    return _fault("MESH-ONE-SIDED", text, twisted, hint, edges=count)
+
+
+def _has_two_sides(mesh: TriMesh) -> bool:
+    """Say whether the faces can be turned so that all look to one side: no walk over edges comes back upside down."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count, m = len(mesh.vertices_mm), len(mesh.faces)
+    tail, head = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
+    code = np.minimum(tail, head) * count + np.maximum(tail, head)
+    order = np.argsort(code, kind="stable")
+    _, first, uses = np.unique(code[order], return_index=True, return_counts=True)
+    one, two = order[first[uses == 2]], order[first[uses == 2] + 1]
+    alike = tail[one] != tail[two]  # faces that look to one side run their edge in opposite directions
+    a, b = one // 3, two // 3
+    # Each face stands twice, with either side up; a step to a neighbour keeps the side or changes it.
+    up, down = np.where(alike, b, b + m), np.where(alike, b + m, b)
+    steps = np.concatenate([a, a + m]), np.concatenate([up, down])
+    graph = coo_array((np.ones(2 * len(a), dtype=np.int8), steps), shape=(2 * m, 2 * m))
+    label = connected_components(graph.tocsr(), directed=False)[1]
+    return not (label[:m] == label[m:]).any()
 
 
 def _check_genus(mesh: TriMesh, edge_count: int) -> list[Finding]:

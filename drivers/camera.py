@@ -7,6 +7,7 @@ of pictures. Every frame is grey, 8 bits.
 from __future__ import annotations
 
 import contextlib
+import http.client
 import os
 import time
 import urllib.parse
@@ -25,6 +26,8 @@ from drivers.errors import DeviceTimeout, TransportError
 
 PICTURES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
 STREAMS = ("http://", "https://", "rtsp://", "tcp://", "udp://")
+READABLE = "PNG, JPEG, TIFF, BMP or WebP; export others (HEIC, raw) as one of these"
+TAIL_BYTES = 65536  # in which a picture's end mark must stand; telephones write more after it
 TIMEOUT_s = 15.0
 # Without this FFmpeg collects five seconds of a stream before it shows the first frame.
 FFMPEG_OPTIONS = "probesize;32768|analyzeduration;0|fflags;nobuffer"
@@ -136,24 +139,61 @@ def read_picture(path: Path) -> Frame:
 
 
 def fetch_picture(url: str) -> Frame:
-    """Return the picture that a web camera gives at `url`."""
+    """Return the picture that a web camera gives at `url`; it has TIMEOUT_s for all of it."""
+    began_s = time.monotonic()
+    parts = []
     try:
         with urllib.request.urlopen(url, timeout=TIMEOUT_s) as answer:
-            raw = np.frombuffer(answer.read(), dtype=np.uint8)
+            while part := answer.read1(1 << 16):
+                parts.append(part)
+                if time.monotonic() - began_s > TIMEOUT_s:
+                    raise TimeoutError
+            if getattr(answer, "length", None):
+                raise TransportError(url, "the picture ends in the middle", "was the camera unplugged?")
     except TimeoutError as fault:
         raise DeviceTimeout(url, "a picture", TIMEOUT_s, "is the camera still plugged in?") from fault
-    except OSError as fault:
-        raise TransportError(url, f"no picture: {getattr(fault, 'reason', fault)}", "is the camera on?") from fault
-    return Frame(_decode(raw, url), url, datetime.now(UTC).isoformat())
+    except (OSError, http.client.HTTPException) as fault:
+        reason = getattr(fault, "reason", None) or str(fault) or type(fault).__name__
+        raise TransportError(url, f"no picture: {reason}", "is the camera on?") from fault
+    return Frame(_decode(np.frombuffer(b"".join(parts), np.uint8), url), url, datetime.now(UTC).isoformat())
 
 
 def _decode(raw: NDArray[np.uint8], source: str) -> NDArray[np.uint8]:
+    """Return a picture file's grey values, as the sensor saw them: a note on how to turn it is not followed.
+
+    The lens was measured on the sensor, so a picture turned by its EXIF note would be another camera's.
+    """
     import cv2
 
-    image = cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if raw.size else None
+    if not _is_whole(raw):
+        raise TransportError(source, "the picture ends in the middle", "still being written, or badly copied?")
+    how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        with _quiet():
+            image = cv2.imdecode(raw, how) if raw.size else None
+    except cv2.error as fault:
+        raise TransportError(source, f"not a picture that can be read: {fault.err}", READABLE) from fault
     if image is None:
-        raise TransportError(source, "not a picture that can be read", "PNG, JPEG, TIFF, BMP or WebP")
-    return np.asarray(image, dtype=np.uint8)
+        raise TransportError(source, "not a picture that can be read", READABLE)
+    return _eight_bits(image, source)
+
+
+def _is_whole(raw: NDArray[np.uint8]) -> bool:
+    """Say whether a JPEG or PNG has its end; OpenCV fills what is missing with grey and says nothing."""
+    head, tail = raw[:8].tobytes(), raw[-TAIL_BYTES:].tobytes()
+    if head.startswith(b"\xff\xd8"):
+        return b"\xff\xd9" in tail
+    return b"IEND" in tail if head.startswith(b"\x89PNG") else True
+
+
+def _eight_bits(image: NDArray[Any], source: str) -> NDArray[np.uint8]:
+    """Return 8 bits of a picture of up to 16; 10 and 12 bits in 16 (machine cameras) are known by their range."""
+    if image.dtype == np.uint8:
+        return np.asarray(image, dtype=np.uint8)
+    if image.dtype != np.uint16:
+        raise TransportError(source, f"a picture of {image.dtype} values", "8 or 16 bits a pixel")
+    bits = next(bits for bits in (10, 12, 16) if int(image.max()) < 1 << bits)
+    return np.asarray(image >> (bits - 8), dtype=np.uint8)
 
 
 def _capture(url: str) -> Any:

@@ -15,7 +15,8 @@ from typing import Any
 from design.bundle import open_bundle
 from design.coupon import FORM
 from design.findings import Finding
-from fabctl.errors import RefusedError
+from fabctl.errors import RefusedError, UnreadableInput
+from fabctl.files import text_of
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Workspace
 
@@ -53,16 +54,13 @@ def read_form(path: Path, length_error_mm: float) -> list[Measured]:
     Several readings of one length stand in its field parted by spaces or semicolons. `length_error_mm` is the standard
     error of one reading of the rule or calliper; it counts once for a patch, the scatter of readings beside it.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as fault:
-        raise RefusedError("the form cannot be read", [Finding("COUPON-FORM", str(fault), where=str(path))]) from fault
+    text = text_of(path, "a coupon's form")
     rows = list(csv.DictReader(text.splitlines()))
     names = rows[0].keys() if rows else ()
     missing = [name for name in FORM if name not in names]
     if missing:
         text = f"has no column {', '.join(missing)}" if rows else "has no rows"
-        raise RefusedError("not a coupon's form", [Finding("COUPON-FORM", text, where=str(path))])
+        raise UnreadableInput("not a coupon's form", [Finding("COUPON-FORM", text, where=str(path))])
     found: list[Finding] = []
     patches = [_patch(row, f"{path}:{line}", length_error_mm, found) for line, row in enumerate(rows, start=2)]
     names_seen = [row["patch"] for row in rows]

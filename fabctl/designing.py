@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import dataclass
 from dataclasses import replace as changed
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import yaml
 
-from design.bundle import Bundle, write_bundle, write_coupon_bundle
+from design.bundle import Bundle, refuse_taken, write_bundle, write_coupon_bundle
 from design.cells.contracting import load_contracting
 from design.cells.library import CellLibrary, load_library
 from design.cells.select import select
@@ -18,19 +20,23 @@ from design.cells.sheet import Sheet
 from design.coupon import Coupon, coupon
 from design.export.gcode import GcodeOptions
 from design.findings import Finding
+from design.flatten.cut import chain_through
 from design.job import JobOptions, compose_job
-from design.meshfiles import read_mesh
+from design.meshfiles import read_given_flat, read_mesh
 from design.pattern.paths import Layer, LayerPreset
 from design.pattern.toolpath import ToolOptions
 from design.pipeline import Design, build
-from design.spec import DesignSpec, Kind
+from design.spec import DesignSpec, Kind, Rim
 from design.surface import TriMesh
 from design.targets import TARGETS
+from fabctl.config.bench import names
 from fabctl.config.coupon import CouponConfig
 from fabctl.config.material import LayerConfig, MaterialConfig, load_material
 from fabctl.config.spec import MadeTarget, SpecConfig, ToolConfig, load_spec
 from fabctl.errors import RefusedError, UsageError
 from fabctl.events import Emit, Event, silent
+
+WRITING_FROM_FRAC = 0.99  # of a build: what is left is writing the folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,17 +51,25 @@ class Inputs:
     findings: tuple[Finding, ...]
 
 
-def read_inputs(name: str, home: Path, target: Path | None = None, cell_mm: float | None = None) -> Inputs:
-    """Return the inputs of the specification called `name`; `target` and `cell_mm` take the place of the file's.
+def read_inputs(
+    name: str, home: Path, target: Path | None = None, cell_mm: float | None = None, library: Path | None = None
+) -> Inputs:
+    """Return the inputs of the specification called `name`; what else is given takes the place of the file's.
 
     Raises `ConfigError`, `UsageError`, `MeshError` or `RefusedError`, each with all that is wrong.
     """
     config, path = load_spec(name, home)
-    return _inputs_of(config, path.read_text(encoding="utf-8"), path.parent, home, target, cell_mm)
+    return _inputs_of(config, path.read_text(encoding="utf-8"), path.parent, home, target, cell_mm, library)
 
 
 def _inputs_of(
-    config: SpecConfig, text: str, beside: Path, home: Path, target: Path | None, cell_mm: float | None
+    config: SpecConfig,
+    text: str,
+    beside: Path,
+    home: Path,
+    target: Path | None,
+    cell_mm: float | None,
+    library: Path | None,
 ) -> Inputs:
     material = load_material(config.material, home)
     edge_mm = cell_mm or config.cell_mm or material.edge_mm
@@ -64,34 +78,70 @@ def _inputs_of(
     assert material.laser is not None  # presets_of has refused otherwise
     spec = config.to_design(edge_mm, sheet.hinge_mm, material.laser.kerf_mm)
     mesh, findings = read_target(config, beside, target)
-    library = library_of(config).scaled(sheet)
-    return Inputs(spec, text, mesh, library, presets, tuple(findings))
+    if config.flatten.source == "target":
+        flat_mm = read_given_flat(target_file(config, beside, target), mesh)
+        spec = changed(spec, flatten=changed(spec.flatten, given_mm=flat_mm))
+    if config.flatten.cut_mm is not None:
+        spec = changed(
+            spec, flatten=changed(spec.flatten, cut_path=chain_through(mesh, np.array(config.flatten.cut_mm)))
+        )
+    file = library or library_file(config, beside)
+    cells = library_of(config, file).scaled(sheet)
+    return Inputs(spec, keeping("library", file, text), mesh, cells, presets, tuple(findings))
 
 
-def library_of(config: SpecConfig) -> CellLibrary:
-    """Return the library of the cells that a specification takes."""
-    path = Path(config.library) if config.library else None
-    return load_library(path) if config.cells == "expanding" else load_contracting(path)
+def library_file(config: SpecConfig, beside: Path) -> Path | None:
+    """Return the library that a specification names, looked for beside it first; None for the shipped one."""
+    if config.library is None:
+        return None
+    return beside / config.library if (beside / config.library).is_file() else Path(config.library)
+
+
+def library_of(config: SpecConfig, file: Path | None) -> CellLibrary:
+    """Return the library of a specification's kind of cells in `file`, the shipped one without."""
+    return load_library(file) if config.cells == "expanding" else load_contracting(file)
+
+
+def keeping(key: str, value: Path | None, text: str) -> str:
+    """Return a specification's text with the whole path of a file, so that the design can be built from its folder."""
+    if value is None or not text:
+        return text
+    return re.sub(rf"(?m)^{key}:.*\n?", "", text).rstrip("\n") + f"\n{key}: {json.dumps(str(value.resolve()))}\n"
 
 
 def inputs_for(
-    target: str, material: str, home: Path, cell_mm: float | None = None, cells: Kind = "expanding"
+    target: str,
+    material: str | None,
+    home: Path,
+    cell_mm: float | None = None,
+    cells: Kind | None = None,
+    library: Path | None = None,
 ) -> Inputs:
-    """Return the inputs for a target alone: a specification, a mesh file, or the name of one of our own surfaces."""
-    if Path(target).suffix in (".yaml", ".yml"):
-        return read_inputs(target, home, cell_mm=cell_mm)
+    """Return the inputs for a specification, a mesh file, or the name of one of our own surfaces.
+
+    A name that is both, such as `cap`, is the specification, as for `fabctl design build`; the surface where `material`
+    or `cells` are given, which a specification says itself.
+    """
+    is_spec = Path(target).suffix in (".yaml", ".yml") or target in names("specs", home)
+    if is_spec and material is None and cells is None:
+        return read_inputs(target, home, None, cell_mm, library)
+    if is_spec and target not in TARGETS:
+        raise UsageError(f"{target}: a specification says its material and cells itself; change them there")
     source: str | MadeTarget = MadeTarget(make=target) if target in TARGETS else target
     config = SpecConfig(
-        name=re.sub(r"\W", "-", Path(target).stem) or "target", target=source, material=material, cells=cells
+        name=re.sub(r"\W", "-", Path(target).stem) or "target",
+        target=source,
+        material=material or SpecConfig.model_fields["material"].default,
+        cells=cells or "expanding",
     )
-    return _inputs_of(config, "", Path.cwd(), home, None, cell_mm)
+    return _inputs_of(config, "", Path.cwd(), home, None, cell_mm, library)
 
 
 def design_of(inputs: Inputs, emit: Emit = silent) -> Design:
     """Return the design of the inputs."""
 
     def watch(message: str, done_frac: float) -> None:
-        emit(Event("progress", message, done_frac))
+        emit(Event("progress", message, WRITING_FROM_FRAC * done_frac))
 
     return build(inputs.spec, inputs.mesh, inputs.library, inputs.presets, watch, inputs.findings)
 
@@ -105,41 +155,57 @@ def build_folder(
     replace: bool = False,
     emit: Emit = silent,
     compensate: bool = False,
+    library: Path | None = None,
 ) -> tuple[Design, Bundle]:
     """Build the specification called `name` into `folder`; return the design and its folder."""
-    inputs = read_inputs(name, home, target, cell_mm)
+    refuse_taken(folder, replace)
+    inputs = read_inputs(name, home, target, cell_mm, library)
     if compensate:
         inputs = changed(inputs, spec=changed(inputs.spec, compensate=True))
     design = design_of(inputs, emit)
-    emit(Event("progress", "writing the design folder", 0.99))
-    return design, write_bundle(design, inputs.text, folder, replace)
+    emit(Event("progress", "writing the design folder", WRITING_FROM_FRAC))
+    bundle = write_bundle(design, inputs.text, folder, replace)
+    emit(Event("progress", "written", 1.0))
+    return design, bundle
 
 
-def build_compensated(bundle: Bundle, folder: Path, home: Path, emit: Emit = silent) -> tuple[Design, Finding]:
+def build_compensated(
+    bundle: Bundle, folder: Path, home: Path, emit: Emit = silent, rim: Literal[True] | Rim = True
+) -> tuple[Design, Finding]:
     """Build a design folder anew with compensated expansions; raise `RefusedError` where they do not help.
+
+    `rim` says on what the sheet bears its weight; True: it is free of both.
 
     The specification kept in the new folder asks for the compensation itself, so that it can be built from there.
     """
+    refuse_taken(folder)
     spec_path, target = bundle.file("spec.yaml"), bundle.file("target.ply")
     cell_mm = bundle.manifest["facts"].get("cell_mm")  # the command line may have asked for other cells than the file
     inputs = read_inputs(str(spec_path), home, target, cell_mm)
-    design = design_of(changed(inputs, spec=changed(inputs.spec, compensate=True)), emit)
+    design = design_of(changed(inputs, spec=changed(inputs.spec, compensate=rim)), emit)
     told = next((f for f in design.findings if f.code in ("COMPENSATED", "COMPENSATE-NOT")), None)
     if told is None or told.code == "COMPENSATE-NOT":
         raise RefusedError("the design was not compensated", [told] if told else [])
-    text = re.sub(r"(?m)^compensate:.*\n", "", inputs.text).rstrip("\n") + "\ncompensate: true\n"
+    text = re.sub(r"(?m)^compensate:.*\n", "", inputs.text).rstrip("\n") + f"\ncompensate: {str(rim).lower()}\n"
     write_bundle(design, text, folder)
     return design, told
 
 
 def read_target(config: SpecConfig, folder: Path, target: Path | None) -> tuple[TriMesh, list[Finding]]:
     """Return the surface that a specification names; a file is looked for in `folder` first."""
-    if target is not None:
-        return read_mesh(target)
-    if isinstance(config.target, MadeTarget):
+    if target is None and isinstance(config.target, MadeTarget):
         return made(config.target), []
+    return read_mesh(target_file(config, folder, target))
+
+
+def target_file(config: SpecConfig, folder: Path, target: Path | None) -> Path:
+    """Return the file of the surface; raise `UsageError` where the surface is made, not read."""
+    if target is not None:
+        return target
+    if isinstance(config.target, MadeTarget):
+        raise UsageError("`flatten.source: target` takes the flat from the target's file, and this target has none")
     beside = folder / config.target
-    return read_mesh(beside if beside.is_file() else Path(config.target))
+    return beside if beside.is_file() else Path(config.target)
 
 
 def made(asked: MadeTarget) -> TriMesh:

@@ -46,6 +46,12 @@ class RefusedError(FabctlError):
         return "\n  ".join([self.what, *map(str, self.findings)])
 
 
+class UnreadableInput(RefusedError):
+    """A file is not of the kind that was expected, or holds nothing of it."""
+
+    exit_code = USAGE
+
+
 class RecordError(FabctlError):
     """A run folder cannot be written or read."""
 
@@ -54,6 +60,18 @@ class RecordError(FabctlError):
 
 class BenchBusy(FabctlError):
     """Somebody else works at this bench."""
+
+    exit_code = DEVICE
+
+
+class ClusterAway(FabctlError):
+    """The machines that should share the work cannot be reached."""
+
+    exit_code = DEVICE
+
+
+class WorkerDied(FabctlError):
+    """A process that shared the work is gone; what was finished is kept."""
 
     exit_code = DEVICE
 

@@ -73,6 +73,23 @@ class Workspace:
             raise UsageError(f"no specimen {name!r} in {self.specimens} (the latest: {known})")
         return Specimen(path)
 
+    def run(self, name: str) -> RunFolder:
+        """Return the run that `name` means: its id, the beginning or end of it, or its folder."""
+        direct = Path(name)
+        if "/" in name or (direct / "manifest.json").is_file():
+            if not (direct / "manifest.json").is_file():
+                raise UsageError(f"{name}: no run lies there; `fabctl run list` names them")
+            return open_run(direct)
+        folders = [p for p in self.runs.iterdir() if p.is_dir()] if self.runs.is_dir() else []
+        matches = [p for p in folders if p.name == name] or [
+            p for p in folders if name and _begins_or_ends(p.name, name)
+        ]
+        if len(matches) == 1:
+            return open_run(matches[0])
+        if not matches:
+            raise UsageError(f"no run {name!r} in {self.runs}; `fabctl run list` names them")
+        raise UsageError(f"{name!r} may be any of {', '.join(sorted(p.name for p in matches))}")
+
     def all_runs(self) -> list[RunFolder]:
         """Return every readable run, oldest first."""
         found = []
@@ -87,6 +104,10 @@ class Workspace:
         """Return the runs of one specimen, oldest first."""
         wanted = [run for run in self.all_runs() if run.manifest().get("specimen") == specimen]
         return [run for run in wanted if kind is None or run.manifest().get("kind") == kind]
+
+
+def _begins_or_ends(whole: str, part: str) -> bool:
+    return whole.startswith(part) or whole.endswith(part)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from design.cells import homogenise
 from design.cells.geometry import strip_mm
-from design.cells.homogenise import Cell, Failure, Pair
+from design.cells.homogenise import Cell
 from design.cells.library import CellLibrary, energy_scale_mJ
 from design.cells.mesh import REFERENCE, Density
 from design.cells.sheet import Sheet
@@ -80,6 +81,7 @@ class Comparison:
 
 COLUMNS = ("t_over_l0", "theta_rad", "expansion_ratio", "energy_barrier", "stiffness")
 PLACE_COLUMNS = COLUMNS[:2]  # without them a row is no cell; a missing figure is only not compared
+UNITS = {"t_over_l0": ("1", "-", "mm/mm"), "theta_rad": ("rad", "radian", "radians"), "expansion_ratio": ("1", "-")}
 TOLD_FAULTS_COUNT = 20
 
 
@@ -96,13 +98,19 @@ class TableError(DesignError):
 def read_published(text: str, sheet: Sheet) -> Published:
     """Return the table in `text`, whose header names `COLUMNS` in any order and case, among others.
 
-    An empty or `nan` figure is kept as NaN and not compared. Raises `TableError` with every fault at once.
+    A name may be followed by its unit in brackets; cells are parted by commas, semicolons or tabs. An empty or `nan`
+    figure is kept as NaN and not compared. Raises `TableError` with every fault at once.
     """
     lines = [(k, line) for k, line in enumerate(text.lstrip("\ufeff").splitlines(), 1) if _is_content(line)]
     if not lines:
         raise TableError([f"the table is empty; its header must name {', '.join(COLUMNS)}"])
-    names = [name.strip().lower() for name in _cells(lines[0][1])]
+    mark = max(",;\t", key=lines[0][1].count)
+    headings = [_heading(cell) for cell in _cells(lines[0][1], mark)]
+    names = [name for name, _ in headings]
     faults = [f"no column {name} in the header" for name in COLUMNS if name not in names]
+    faults += [
+        f"{name} is in {unit}, it must be in {UNITS[name][0]}" for name, unit in headings if _foreign(name, unit)
+    ]
     faults += [f"the header names {name} more than once" for name in COLUMNS if names.count(name) > 1]
     if faults:
         raise TableError(faults)
@@ -111,7 +119,7 @@ def read_published(text: str, sheet: Sheet) -> Published:
     places = [names.index(name) for name in COLUMNS]
     rows = []
     for number, line in lines[1:]:
-        cells = _cells(line)
+        cells = _cells(line, mark)
         if len(cells) != len(names):
             faults.append(f"line {number}: {len(cells)} cells under {len(names)} names")
             continue
@@ -127,8 +135,18 @@ def _is_content(line: str) -> bool:
     return bool(line.strip()) and not line.lstrip().startswith("#")
 
 
-def _cells(line: str) -> list[str]:
-    return next(csv.reader([line]))
+def _cells(line: str, mark: str) -> list[str]:
+    return next(csv.reader([line], delimiter=mark))
+
+
+def _heading(cell: str) -> tuple[str, str]:
+    """Return name and unit ('' for none) of a heading such as `theta_rad [rad]`, in lower case."""
+    name, bracket, unit = re.sub(r"[(\[]", "(", cell.strip().lower()).partition("(")
+    return name.strip(), unit.rstrip(")] ") if bracket else ""
+
+
+def _foreign(name: str, unit: str) -> bool:
+    return bool(unit) and name in UNITS and unit not in UNITS[name]
 
 
 def _number(cell: str, name: str, line: int, faults: list[str]) -> float:
@@ -173,20 +191,12 @@ def _solve_rows(rows: Ints, table: Published, sheet: Sheet, density: Density) ->
 
 
 def _column(t_mm: Array, theta_rad: float, sheet: Sheet, density: Density) -> list[Cell]:
-    cells = []
-    before: list[Pair] = []
+    cells, trail = [], homogenise.Trail()
     steps = np.diff(t_mm, prepend=np.nan)
     for k, t in enumerate(t_mm):
-        even = len(before) == 2 and 0.8 * steps[k - 1] < steps[k] < 1.2 * steps[k - 1]
-        found = homogenise.solve_pair(
-            float(t), theta_rad, sheet, density, homogenise.predicted(*before) if even else None
-        )
-        if isinstance(found, Failure):
-            cells.append(Cell(float(t), theta_rad, found.verdict, found.reason, found.residual_ratio))
-            before = []
-        else:
-            cells.append(homogenise.numbers(float(t), theta_rad, found[0], found[1]))
-            before = [*before[-1:], found[1]]
+        even = bool(0.8 * steps[k - 1] < steps[k] < 1.2 * steps[k - 1])
+        found, mesh_ratio, trail = homogenise.walked(float(t), theta_rad, sheet, density, trail, even)
+        cells.append(homogenise.cell_of(float(t), theta_rad, found, mesh_ratio))
     return cells
 
 

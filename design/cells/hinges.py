@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from design.cells.homogenise import Cell
 from design.cells.interpolate import Grid, grid_of
-from design.cells.library import VERDICTS, CellLibrary, LibraryError, shape_of
+from design.cells.library import VERDICTS, CellLibrary, LibraryError, load_library, shape_of
 from design.cells.sheet import Sheet
 from design.errors import DesignError
 
@@ -113,10 +113,10 @@ def check_reach(library: CellLibrary, hinge_mm: float) -> None:
 
 
 def _change(library: CellLibrary, known: Hinges, width_mm: float) -> Grid:
-    """Return the differences from the library's fields, as its columns lie."""
+    """Return the differences from the shipped library's fields, whose mesh the sweeps have, as its columns lie."""
     stretch = library.sheet.edge_mm / known.sheet.edge_mm
     t = known.t_mm * stretch
-    base = library.grid(t, known.theta_rad)
+    base = load_library().scaled(library.sheet).grid(t, known.theta_rad)
     lengths = np.array([1.0, stretch**2, stretch**2, 1.0])[:, None]
     widths = np.append(known.hinge_mm, known.sheet.hinge_mm)
     fields = np.concatenate([known.fields * lengths, base[None]])

@@ -25,7 +25,8 @@ Array = NDArray[np.float64]
 Verdict = Literal["bistable", "not bistable", "invalid", "not converged"]
 
 SECTORS = 18  # in a hexagonal cell
-LEAST_WELL_RATIO = 0.003  # barrier over stored energy; halving the mesh moves it by 0.02 to 0.05 near the fold
+SHALLOW_WELL_RATIO = 0.03  # barrier over stored energy: below, half the mesh size moves it by more than itself
+FINER = 2  # how much finer the mesh is that shallow wells are decided on
 STEP_RATIO = 0.02  # of the stretch between two equilibria on the path
 SMALLEST_STEP_RATIO = 0.02 / 64
 BEYOND_RATIO = 0.12  # how far past the linkage's own expansion the path is followed
@@ -47,6 +48,7 @@ class Cell:
     stored_mm2: float | None = None  # energy at P5
     stiffness_mm2: float | None = None
     nu_tangent_ratio: float | None = None
+    mesh_ratio: float | None = None  # size of the mesh that gave the figures, over the one asked for
     open_ratio: float | None = None  # open cells: the expansion of the slit cell they are cut as
     overlap_frac: float | None = None  # open cells: material lying on material once closed
     curve_mm2: list[float] | None = None  # energy of the even stretch at CURVE_SHARES, for some cells
@@ -69,17 +71,53 @@ class Failure:
     residual_ratio: float = math.nan
 
 
+Found = tuple[Model, Pair] | Failure
+
+
+@dataclass(frozen=True, slots=True)
+class Trail:
+    """The states of the last one or two cells of a row, from which the next may start, on its mesh and on the finer."""
+
+    pairs: tuple[Pair, ...] = ()
+    finer: tuple[Pair, ...] = ()
+
+    def joined(self, found: Found, finer: Found | None) -> Trail:
+        """Return the trail one cell further; a cell without states breaks it off."""
+        return Trail(_joined(self.pairs, found), _joined(self.finer, finer))
+
+
+def _joined(pairs: tuple[Pair, ...], found: Found | None) -> tuple[Pair, ...]:
+    return () if found is None or isinstance(found, Failure) else (*pairs[-1:], found[1])
+
+
 def solve_cell(t_mm: float, theta_rad: float, sheet: Sheet, density: Density = REFERENCE) -> Cell:
     """Return the cell (t, θ), solved from rest."""
-    found = solve_pair(t_mm, theta_rad, sheet, density)
-    if isinstance(found, Failure):
-        return Cell(t_mm, theta_rad, found.verdict, found.reason, found.residual_ratio)
-    return numbers(t_mm, theta_rad, found[0], found[1])
+    found, mesh_ratio, _ = walked(t_mm, theta_rad, sheet, density, Trail())
+    return cell_of(t_mm, theta_rad, found, mesh_ratio)
 
 
-def solve_pair(
-    t_mm: float, theta_rad: float, sheet: Sheet, density: Density, guess: Pair | None = None
-) -> tuple[Model, Pair] | Failure:
+def walked(
+    t_mm: float, theta_rad: float, sheet: Sheet, density: Density, trail: Trail, even: bool = True
+) -> tuple[Found, float, Trail]:
+    """Return what is found at (t, θ), the size of the mesh that decided over that of `density`, and the trail after it.
+
+    Where the well is shallow a mesh of half the size decides. `even` says that t goes on by the step it went before.
+    """
+    found = solve_pair(t_mm, theta_rad, sheet, density, _ahead_of(trail.pairs, even))
+    if isinstance(found, Failure) or not is_shallow(found[1]):
+        return found, 1.0, trail.joined(found, None)
+    finer = solve_pair(t_mm, theta_rad, sheet, density.refined(FINER), _ahead_of(trail.finer, even))
+    after = trail.joined(found, finer)
+    if isinstance(finer, Failure):
+        finer = Failure(finer.verdict, f"at half the mesh size, the well being shallow: {finer.reason}")
+    return finer, 1 / FINER, after
+
+
+def _ahead_of(pairs: tuple[Pair, ...], even: bool) -> Pair | None:
+    return predicted(*pairs) if even and len(pairs) == 2 else None
+
+
+def solve_pair(t_mm: float, theta_rad: float, sheet: Sheet, density: Density, guess: Pair | None = None) -> Found:
     """Return the model and its two states: by Newton from `guess` where that holds, else along the path from rest."""
     reason = fault(t_mm, theta_rad, sheet)
     if reason is not None:
@@ -96,13 +134,17 @@ def solve_pair(
     return found if isinstance(found, Failure) else (m, found)
 
 
-def numbers(t_mm: float, theta_rad: float, m: Model, pair: Pair) -> Cell:
-    """Return the cell's figures from its two states."""
+def is_shallow(pair: Pair) -> bool:
+    """Tell whether the mesh's error of the barrier is as large as the barrier."""
+    return (pair.saddle.energy_mm2 - pair.stable.energy_mm2) / pair.stable.energy_mm2 < SHALLOW_WELL_RATIO
+
+
+def cell_of(t_mm: float, theta_rad: float, found: Found, mesh_ratio: float = 1.0) -> Cell:
+    """Return the cell's figures from its two states, or the verdict without any."""
+    if isinstance(found, Failure):
+        return Cell(t_mm, theta_rad, found.verdict, found.reason, found.residual_ratio)
+    m, pair = found
     saddle, stable = pair.saddle, pair.stable
-    well = (saddle.energy_mm2 - stable.energy_mm2) / stable.energy_mm2
-    if well < LEAST_WELL_RATIO:
-        reason = f"the barrier is less than {LEAST_WELL_RATIO:.1%} of the energy stored: too near the fold for the mesh"
-        return Cell(t_mm, theta_rad, "not bistable", reason, stable.residual_ratio)
     linear = moduli(m, m.nodes(stable.y, stable.s_ratio))
     return Cell(
         t_mm,
@@ -116,6 +158,7 @@ def numbers(t_mm: float, theta_rad: float, m: Model, pair: Pair) -> Cell:
         stored_mm2=SECTORS * stable.energy_mm2,
         stiffness_mm2=linear.stiffness_mm2,
         nu_tangent_ratio=linear.nu_ratio,
+        mesh_ratio=mesh_ratio,
     )
 
 

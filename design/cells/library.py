@@ -11,6 +11,7 @@ import io
 import json
 import math
 import re
+import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -25,19 +26,26 @@ from design.cells.homogenise import CURVE_SHARES, Cell
 from design.cells.interpolate import Grid, grid_of
 from design.cells.sheet import Sheet
 from design.cells.sweep import Plan
-from design.errors import DesignError
+from design.errors import UnreadableFile
 
 Array = NDArray[np.float64]
 FORMAT = 1
 SHIPPED = Path(__file__).parent / "data" / "library.npz"
 SHIPPED_OPEN = SHIPPED.with_name("library-open.npz")
 VERDICTS = ("bistable", "not bistable", "invalid", "not converged")
-SHALLOW = "too near the fold for the mesh"  # how `homogenise.numbers` ends its reason for a well below its limit
-NUMBERS = ("expansion_ratio", "saddle_ratio", "barrier_mm2", "stored_mm2", "stiffness_mm2", "nu_tangent_ratio")
+NUMBERS = (
+    "expansion_ratio",
+    "saddle_ratio",
+    "barrier_mm2",
+    "stored_mm2",
+    "stiffness_mm2",
+    "nu_tangent_ratio",
+    "mesh_ratio",
+)
 OPEN_NUMBERS = ("open_ratio", "overlap_frac")
 
 
-class LibraryError(DesignError):
+class LibraryError(UnreadableFile):
     """The file is not a library, or not one this version reads."""
 
 
@@ -101,17 +109,10 @@ class CellLibrary:
         words = [_general(self.meta["reasons"][int(k)]) for k in self.table["reason"][self.table["verdict"] != 0]]
         return dict(Counter(words).most_common())
 
-    def shallow_count(self) -> int:
-        """Return how many candidates have a second state too shallow for the mesh; they are counted not bistable."""
-        return len(self.shallow_cells()[0])
-
     def shallow_cells(self) -> tuple[Array, Array]:
-        """Return (t_mm, theta_rad), (n,) each, of those candidates."""
-        rows = np.isin(self.table["reason"], self._shallow_reasons())
+        """Return (t_mm, theta_rad), (n,) each, of the cells whose shallow well was decided at half the mesh size."""
+        rows = self.table.get("mesh_ratio", np.ones(len(self.table["t_mm"]))) < 1
         return self.table["t_mm"][rows], self.table["theta_rad"][rows]
-
-    def _shallow_reasons(self) -> list[int]:
-        return [k for k, reason in enumerate(self.meta["reasons"]) if reason.endswith(SHALLOW)]
 
     def at(self, t_mm: Array | float, theta_rad: Array | float) -> CellProperties:
         """Return the cells (t, θ), broadcast; NaN and `inside` False where no bistable cells surround the point."""
@@ -135,6 +136,8 @@ class CellLibrary:
             raise LibraryError(f"no bistable cell at t = {t_mm:g} mm, θ = {math.degrees(theta_rad):g}°")
         stored_mm2 = float(self._read("stored_mm2", t_mm, theta_rad))
         rows, curves = self.table["curve_row"].astype(int), self.table["curve_mm2"]
+        if not len(rows):
+            raise LibraryError(f"{self.meta['command']} has no energy curves")
         away = np.hypot(
             (self.table["t_mm"][rows] - t_mm) / self.sheet.edge_mm, self.table["theta_rad"][rows] - theta_rad
         )
@@ -233,19 +236,34 @@ def save_library(path: Path, plan: Plan, sheet: Sheet, cells: Sequence[Cell], co
 
 @functools.lru_cache(maxsize=4)
 def load_library(path: Path | None = None) -> CellLibrary:
-    """Return the library in `path`; without one, the shipped library of the paper's sheet."""
+    """Return the library in `path`, an .npz or a published map as .csv; without one, the shipped library."""
     source = SHIPPED if path is None else path
+    if source.suffix.lower() == ".csv":
+        from design.cells.published_map import published_library
+
+        return published_library(source)
     try:
         with np.load(source) as file:
             table = {name: file[name] for name in file.files if name != "meta"}
             meta = json.loads(file["meta"].tobytes())
-    except (OSError, ValueError, KeyError) as fault:
-        raise LibraryError(
-            f"{source}: not a library of cells ({fault}); build one with `fabctl library build`"
-        ) from fault
-    if meta.get("format") != FORMAT:
-        raise LibraryError(f"{source}: format {meta.get('format')}, this version reads {FORMAT}; build it anew")
-    return _with_sheet(table, meta, meta["key"], Sheet(**meta["sheet"]))
+    except (OSError, ValueError, KeyError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as fault:
+        raise LibraryError(f"{source}: {_why_not(fault)}; build one with `fabctl library build`") from fault
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        told = meta.get("format") if isinstance(meta, dict) else "unknown"
+        raise LibraryError(f"{source}: format {told}, this version reads {FORMAT}; build it anew")
+    try:
+        return _with_sheet(table, meta, meta["key"], Sheet(**meta["sheet"]))
+    except (ValueError, KeyError, TypeError, IndexError) as fault:
+        raise LibraryError(f"{source}: is damaged: its table is not whole; build it anew") from fault
+
+
+def _why_not(fault: Exception) -> str:
+    """Return in words why a file is no library: NumPy's are about pickles and magic strings."""
+    if isinstance(fault, FileNotFoundError):
+        return "no such file"
+    if isinstance(fault, OSError) and fault.strerror:
+        return f"cannot be read: {fault.strerror.lower()}"
+    return "holds no library of cells" if isinstance(fault, KeyError) else "is no library of cells, or damaged"
 
 
 def _with_sheet(table: dict[str, Array], meta: dict[str, Any], key: str, sheet: Sheet) -> CellLibrary:

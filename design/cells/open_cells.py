@@ -14,7 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.cells.geometry import THIRD_TURN, centroid_mm
-from design.cells.homogenise import Cell, Failure, Pair, follow, numbers, solve_pair
+from design.cells.homogenise import (
+    FINER,
+    Cell,
+    Failure,
+    Found,
+    Pair,
+    Trail,
+    cell_of,
+    follow,
+    is_shallow,
+    solve_pair,
+    walked,
+)
 from design.cells.mesh import REFERENCE, Density, topology
 from design.cells.sector import Model, model_of
 from design.cells.sheet import Sheet
@@ -59,25 +71,34 @@ def open_model(closed: Model, pair: Pair, sheet: Sheet) -> Model:
 
 
 def solve_open_cell(
-    t_mm: float, theta_rad: float, sheet: Sheet, density: Density = REFERENCE, guess: Pair | None = None
-) -> tuple[Cell, Pair | None]:
-    """Return the open cell of (t, θ), expansion below one, and the slit cell's states for a neighbour to start from."""
-    slit = solve_pair(t_mm, theta_rad, sheet, density, guess)
+    t_mm: float, theta_rad: float, sheet: Sheet, density: Density = REFERENCE, trail: Trail | None = None
+) -> tuple[Cell, Trail]:
+    """Return the open cell of (t, θ), expansion below one, and the slit cells' states for a neighbour to start from.
+
+    Where the slit cell's well is shallow, or the open cell's own, half the mesh size decides.
+    """
+    slit, mesh_ratio, after = walked(t_mm, theta_rad, sheet, density, trail or Trail())
+    found = _closed(slit, sheet)
+    if mesh_ratio == 1 and not isinstance(found, Failure) and is_shallow(found[1]):
+        slit, mesh_ratio = solve_pair(t_mm, theta_rad, sheet, density.refined(FINER)), 1 / FINER
+        found = _closed(slit, sheet)
+    cell = cell_of(t_mm, theta_rad, found, mesh_ratio)
+    if isinstance(slit, Failure) or isinstance(found, Failure):
+        return cell, after
+    m, stable = found[0], found[1].stable
+    overlap = overlap_frac(m, m.nodes(stable.y, stable.s_ratio), stable.s_ratio)
+    return replace(cell, open_ratio=slit[1].stable.s_ratio, overlap_frac=overlap), after
+
+
+def _closed(slit: Found, sheet: Sheet) -> Found:
+    """Return the open cell that a slit cell is cut as, with its two states."""
     if isinstance(slit, Failure):
-        return Cell(t_mm, theta_rad, slit.verdict, f"as a slit cell: {slit.reason}", slit.residual_ratio), None
-    closed, pair = slit
-    ratio = pair.stable.s_ratio
-    m = open_model(closed, pair, sheet)
+        return Failure(slit.verdict, f"as a slit cell: {slit.reason}", slit.residual_ratio)
+    m = open_model(*slit, sheet)
     if m.weights.min() <= 0:
-        return Cell(t_mm, theta_rad, "invalid", "the deployed outline folds the mesh"), pair
-    found = follow(m, CLOSED_SHARE / ratio)
-    if isinstance(found, Failure):
-        return Cell(t_mm, theta_rad, found.verdict, found.reason, found.residual_ratio), pair
-    cell = numbers(t_mm, theta_rad, m, found)
-    if cell.verdict == "bistable":
-        overlap = overlap_frac(m, m.nodes(found.stable.y, found.stable.s_ratio), found.stable.s_ratio)
-        cell = replace(cell, open_ratio=ratio, overlap_frac=overlap)
-    return cell, pair
+        return Failure("invalid", "the deployed outline folds the mesh")
+    pair = follow(m, CLOSED_SHARE / slit[1].stable.s_ratio)
+    return pair if isinstance(pair, Failure) else (m, pair)
 
 
 def overlap_frac(m: Model, nodes_mm: Array, s_ratio: float) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.cells.geometry import THIRD_TURN
-from design.cells.homogenise import Failure, Pair, solve_pair
+from design.cells.homogenise import Failure, Pair, Trail, walked
 from design.cells.mesh import REFERENCE, Density, topology
 from design.cells.sector import Model
 from design.cells.sheet import Sheet
@@ -35,10 +35,8 @@ class CellStates:
 
 def cell_states(t_mm: float, theta_rad: float, sheet: Sheet, density: Density = REFERENCE) -> CellStates | Failure:
     """Return the three states of the cell (t, θ), or why it has none."""
-    found = solve_pair(t_mm, theta_rad, sheet, density)
-    if isinstance(found, Failure):
-        return found
-    return states_of(*found)
+    found, _, _ = walked(t_mm, theta_rad, sheet, density, Trail())
+    return found if isinstance(found, Failure) else states_of(*found)
 
 
 def states_of(m: Model, pair: Pair) -> CellStates:

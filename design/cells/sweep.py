@@ -14,16 +14,17 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from design.cells import homogenise, open_cells
 from design.cells.geometry import t_bounds_mm
-from design.cells.homogenise import Cell, Failure, Pair
 from design.cells.mesh import REFERENCE, Density
 from design.cells.sheet import Sheet
+
+if TYPE_CHECKING:  # the solver takes 2 s to load: the process that only shares out the work does so beside the workers
+    from design.cells.homogenise import Cell, Trail
 
 Array = NDArray[np.float64]
 
@@ -105,28 +106,30 @@ def column_t_mm(plan: Plan, theta_rad: float) -> Array:
 
 def solve_column(plan: Plan, theta_rad: float) -> list[Cell]:
     """Return the cells of one column; each starts from the secant through the two before it where that holds."""
-    cells: list[Cell] = []
-    before: list[Pair] = []
+    from design.cells import homogenise
+
+    solve = _solve_open if plan.kind == "open" else _solve_slit
+    cells, trail = [], homogenise.Trail()
     for k, t_mm in enumerate(column_t_mm(plan, theta_rad)):
-        guess = homogenise.predicted(*before) if len(before) == 2 else None
-        cell, pair = _solve_one(plan, float(t_mm), theta_rad, guess, k % CURVE_EVERY == 0)
+        cell, trail = solve(plan, float(t_mm), theta_rad, trail, k % CURVE_EVERY == 0)
         cells.append(cell)
-        before = [] if pair is None else [*before[-1:], pair]
     return cells
 
 
-def _solve_one(
-    plan: Plan, t_mm: float, theta_rad: float, guess: Pair | None, with_curve: bool
-) -> tuple[Cell, Pair | None]:
-    if plan.kind == "open":
-        return open_cells.solve_open_cell(t_mm, theta_rad, plan.sheet, plan.density, guess)
-    found = homogenise.solve_pair(t_mm, theta_rad, plan.sheet, plan.density, guess)
-    if isinstance(found, Failure):
-        return Cell(t_mm, theta_rad, found.verdict, found.reason, found.residual_ratio), None
-    cell = homogenise.numbers(t_mm, theta_rad, *found)
-    if with_curve and cell.verdict == "bistable":
+def _solve_slit(plan: Plan, t_mm: float, theta_rad: float, trail: Trail, with_curve: bool) -> tuple[Cell, Trail]:
+    from design.cells import homogenise
+
+    found, mesh_ratio, trail = homogenise.walked(t_mm, theta_rad, plan.sheet, plan.density, trail)
+    cell = homogenise.cell_of(t_mm, theta_rad, found, mesh_ratio)
+    if with_curve and not isinstance(found, homogenise.Failure):
         cell = replace(cell, curve_mm2=homogenise.even_curve_mm2(*found))
-    return cell, found[1]
+    return cell, trail
+
+
+def _solve_open(plan: Plan, t_mm: float, theta_rad: float, trail: Trail, _: bool) -> tuple[Cell, Trail]:
+    from design.cells import open_cells
+
+    return open_cells.solve_open_cell(t_mm, theta_rad, plan.sheet, plan.density, trail)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +185,8 @@ def sweep(
             elapsed = time.monotonic() - begin
             left = elapsed * (total - done) / (done - kept) if done > kept else None
             report(Progress(done, total, elapsed, left))
+    from design.cells.homogenise import Cell
+
     return [Cell(**row) for k in wanted for row in solved[k]]
 
 
@@ -193,7 +198,10 @@ def _results(works: list[Work], jobs: int, cluster: str | None) -> Iterator[tupl
     else:
         from joblib import Parallel, delayed
 
-        yield from Parallel(n_jobs=jobs, return_as="generator_unordered")(delayed(_solve_work)(w) for w in works)
+        at_work = Parallel(n_jobs=jobs, return_as="generator_unordered")(delayed(_solve_work)(w) for w in works)
+        import design.cells.library  # noqa: F401 - needed in the end; loaded while the workers are at it
+
+        yield from at_work
 
 
 def _on_cluster(works: list[Work], address: str) -> Iterator[tuple[int, list[dict[str, Any]], float]]:

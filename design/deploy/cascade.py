@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from design.deploy.compare import kabsch
 from design.deploy.levels import Layout
-from design.deploy.newton import System, solve
+from design.deploy.newton import System, smallest_eigenvalue_N_mm, solve
 from design.deploy.shell import Ints, Reals, Shell, neighbours
 from design.errors import NotConverged
 
@@ -60,6 +60,8 @@ class Cascade:
     energy_mJ: float
     residual_ratio: float
     stable: bool
+    smallest_eigenvalue_N_mm: float  # of the last shape
+    iterations_count: int  # to the last shape, once all hands are off
     failed: tuple[str, ...]  # units whose pull found no rest
 
 
@@ -122,7 +124,8 @@ def cascade(
     last = solve(free, x)
     return Cascade(
         tuple(steps), (*frames, last.x_mm), last.x_mm, share_of(shell, last.x_mm) > wells.saddle_ratio,
-        last.energy_mJ, last.residual_ratio, last.stable, tuple(failed),
+        last.energy_mJ, last.residual_ratio, last.stable, smallest_eigenvalue_N_mm(free, last.x_mm, (), None),
+        last.iterations_count, tuple(failed),
     )  # fmt: skip
 
 
@@ -158,8 +161,8 @@ def _pulled(
 ) -> tuple[Reals, Step, NDArray[np.bool_]]:
     """Return the sheet after one more unit was pulled open and those the hand is done with were let go."""
     kept = hand.held()
-    pulled = solve(System(_held_open(free.shell, [unit, *kept])), x, tolerance_ratio=TOLERANCE_RATIO)
-    rest = solve(System(_held_open(free.shell, kept)), pulled.x_mm, tolerance_ratio=TOLERANCE_RATIO)
+    pulled = solve(free.of(_held_open(free.shell, [unit, *kept])), x, tolerance_ratio=TOLERANCE_RATIO)
+    rest = solve(free.of(_held_open(free.shell, kept)), pulled.x_mm, tolerance_ratio=TOLERANCE_RATIO)
     now = share_of(free.shell, rest.x_mm) > wells.saddle_ratio
     others = np.arange(len(now)) != unit
     opened, closed = (np.flatnonzero(c & others).tolist() for c in (now & ~is_open, ~now & is_open))

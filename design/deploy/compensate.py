@@ -6,7 +6,7 @@ Hessian and g the gradient at rest, dx/dλ = −H⁻¹ ∂g/∂λ.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from design.deploy.compare import kabsch
 from design.deploy.factor import factorise
 from design.deploy.levels import Layout
-from design.deploy.newton import Equilibrium, Load, System, pins, solve
+from design.deploy.newton import Equilibrium, System, pins, solve
 from design.deploy.shell import Ints, Reals, neighbours
+from design.deploy.standing import FREE, Standing
 from design.errors import NotConverged
 
 REACH = 3  # units, across sides, as far as one unit's expansion enters the forces
@@ -46,8 +47,7 @@ def compensate(
     goal_mm: Reals,
     bounds_ratio: tuple[float, float],
     start_mm: Reals | None = None,
-    loads: Sequence[Load] = (),
-    fixed: NDArray[np.bool_] | None = None,
+    standing: Standing = FREE,
     watch: Callable[[float], None] | None = None,
     changeable: NDArray[np.bool_] | None = None,
 ) -> Compensation:
@@ -55,31 +55,19 @@ def compensate(
 
     Only units that are `changeable` `(m,)` are touched (by default all): solid ones have no expansion to choose.
 
-    Without `fixed` degrees of freedom the shape may be moved rigidly; with them it is compared where it stands, and
-    they keep their values of `start_mm`. Expansions stay within `bounds_ratio`, those of the library. Stiffness stays
-    what it was: choose cells anew for the result.
+    `standing` is what acts on the sheet, by default nothing; degrees of freedom that it holds keep their values of
+    `start_mm`. Expansions stay within `bounds_ratio`, those of the library. Stiffness stays what it was: choose cells
+    anew for the result.
     """
-    start = goal_mm if start_mm is None else start_mm
-    found = solve(System(layout.shell()), start, loads, fixed)
-    before = best = _misfit(found.x_mm, goal_mm, fixed)[0]
-    current, damping, rounds = layout, 1e-3, 0
-    roughness = _roughness(layout.cells)
     free = np.ones(len(layout.cells), dtype=bool) if changeable is None else changeable
+    task = _Task(goal_mm, bounds_ratio, standing, _roughness(layout.cells), layout.expansion_ratio, free)
+    start = goal_mm if start_mm is None else start_mm
+    found = solve(System(layout.shell()), start, standing.loads, standing.fixed)
+    before = best = misfit_mm(found.x_mm, goal_mm, standing)
+    current, damping, rounds = layout, 1e-3, 0
     for rounds in range(1, ROUNDS + 1):
         try:
-            trial, rest, misfit, damping = _better(
-                current,
-                found,
-                goal_mm,
-                bounds_ratio,
-                loads,
-                fixed,
-                roughness,
-                layout.expansion_ratio,
-                damping,
-                best,
-                free,
-            )
+            trial, rest, misfit, damping = _better(task, current, found, damping, best)
         except NotConverged:
             break
         gain = best - misfit
@@ -94,28 +82,38 @@ def compensate(
     return Compensation(current, found, before, best, change, stopped, rounds, best < 0.9 * before)
 
 
+@dataclass(frozen=True, slots=True)
+class _Task:
+    goal_mm: Reals
+    bounds_ratio: tuple[float, float]
+    standing: Standing
+    roughness: sp.csr_matrix
+    original_ratio: Reals
+    free: NDArray[np.bool_]
+
+
 def _better(
-    layout: Layout, rest: Equilibrium, goal: Reals, bounds: tuple[float, float], loads: Sequence[Load],
-    fixed: NDArray[np.bool_] | None, roughness: sp.csr_matrix, original: Reals, damping: float, best: float,
-    free: NDArray[np.bool_],
-) -> tuple[Layout, Equilibrium, float, float]:  # fmt: skip
+    task: _Task, layout: Layout, rest: Equilibrium, damping: float, best: float
+) -> tuple[Layout, Equilibrium, float, float]:
     """Return a layout with less misfit, its rest, misfit and the damping to go on with; raise where there is none."""
-    moves = _sensitivity(layout, rest.x_mm, loads, fixed)
-    _, gap = _misfit(rest.x_mm, goal, fixed)
-    if fixed is None:
+    moves = _sensitivity(layout, rest.x_mm, task.standing)
+    gap = _gap_mm(rest.x_mm, task.goal_mm, task.standing)
+    if task.standing.aligned:
         moves = _without_rigid(moves, rest.x_mm)
     normal = moves.T @ moves
     size = float(np.trace(normal)) / len(normal)
-    smooth = SMOOTH_FRAC * size * roughness.toarray()
-    pull = moves.T @ gap.ravel() + smooth @ (layout.expansion_ratio - original)
+    smooth = SMOOTH_FRAC * size * task.roughness.toarray()
+    pull = moves.T @ gap.ravel() + smooth @ (layout.expansion_ratio - task.original_ratio)
+    free = task.free
     for _ in range(8):
         damped = (normal + smooth + damping * size * np.eye(len(normal)))[np.ix_(free, free)]
         wanted = layout.expansion_ratio.copy()
-        wanted[free] = np.clip(wanted[free] - np.linalg.solve(damped, pull[free]), *bounds)
+        wanted[free] = np.clip(wanted[free] - np.linalg.solve(damped, pull[free]), *task.bounds_ratio)
         trial = replace(layout, expansion_ratio=wanted)
         try:
-            found = solve(System(trial.shell()), rest.x_mm, loads, fixed, iterations_max=60)
-            misfit = _misfit(found.x_mm, goal, fixed)[0]
+            held = task.standing
+            found = solve(System(trial.shell()), rest.x_mm, held.loads, held.fixed, iterations_max=60)
+            misfit = misfit_mm(found.x_mm, task.goal_mm, held)
         except NotConverged:
             misfit = np.inf
         if misfit < best:
@@ -124,13 +122,17 @@ def _better(
     raise NotConverged("compensation", best, 8, "no change of the expansions lowers the misfit")
 
 
-def _misfit(x: Reals, goal: Reals, fixed: NDArray[np.bool_] | None) -> tuple[float, Reals]:
-    """Return the RMS distance of corresponding points and the gap `(n, 3)` in the frame of `x`."""
-    if fixed is None:
+def misfit_mm(x_mm: Reals, goal_mm: Reals, standing: Standing = FREE) -> float:
+    """Return the RMS distance of corresponding points; a sheet that is not held is aligned rigidly first."""
+    return float(np.sqrt(np.mean(np.sum(_gap_mm(x_mm, goal_mm, standing) ** 2, axis=1))))
+
+
+def _gap_mm(x: Reals, goal: Reals, standing: Standing) -> Reals:
+    """Return how far each vertex is from where it belongs, `(n, 3)`, in the frame of `x`."""
+    if standing.aligned:
         rotation, shift = kabsch(goal, x)
         goal = goal @ rotation.T + shift
-    gap = x - goal
-    return float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))), gap
+    return x - goal
 
 
 def _without_rigid(moves: Reals, x: Reals) -> Reals:
@@ -142,14 +144,15 @@ def _without_rigid(moves: Reals, x: Reals) -> Reals:
     return np.asarray(moves - basis @ (basis.T @ moves))
 
 
-def _sensitivity(layout: Layout, x: Reals, loads: Sequence[Load], fixed: NDArray[np.bool_] | None) -> Reals:
+def _sensitivity(layout: Layout, x: Reals, standing: Standing) -> Reals:
     """Return dx/dλ, `(3n, m)`, at rest."""
     system = System(layout.shell())
-    hold = pins(x) if fixed is None else fixed
-    lu, _ = factorise(system.held(system.linearise(x, loads)[2], hold))
+    hold = pins(x) if standing.fixed is None else standing.fixed
+    matrix = system.held(system.linearise(x, standing.loads)[2], hold)
+    factor = system.cholesky(matrix, x) or factorise(matrix)[0]
     forces = force_derivative(layout, x).toarray()
     forces[hold.ravel()] = 0.0
-    return np.asarray(-lu.solve(forces))
+    return np.asarray(-factor.solve(forces))
 
 
 def force_derivative(layout: Layout, x: Reals) -> sp.csc_matrix:
@@ -157,13 +160,13 @@ def force_derivative(layout: Layout, x: Reals) -> sp.csc_matrix:
     m, n = len(layout.cells), layout.vertex_count
     reach = _reach(layout.cells, n)
     colours = _colours((reach @ reach.T).tocsr())
-    rows, cols, values = [], [], []
+    rows, cols, values, system = [], [], [], System(layout.shell())
     for colour in range(int(colours.max()) + 1):
         some = np.flatnonzero(colours == colour)
         nudge = np.zeros(m)
         nudge[some] = STEP_RATIO
         more, less = (
-            System(replace(layout, expansion_ratio=layout.expansion_ratio + sign * nudge).shell()).gradient(x)[1]
+            system.of(replace(layout, expansion_ratio=layout.expansion_ratio + sign * nudge).shell()).gradient(x)[1]
             for sign in (1, -1)
         )
         slope = (more - less) / (2 * STEP_RATIO)

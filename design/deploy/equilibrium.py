@@ -70,10 +70,10 @@ def from_flat(
     x = start(chain[0])
     iterations = 0
     for k, level in enumerate(chain):
-        bulge = x if k == 0 else None
+        bulge, system = x if k == 0 else None, System(level.shell())
         for stiffening in COARSEST_STIFFENINGS if k == 0 else FINER_STIFFENINGS:
             exactly = k == len(chain) - 1 and stiffening == 1
-            found = _solve_stiffened(level, x, stiffening, bulge, exactly, watch)
+            found = _solve_stiffened(system, level, x, stiffening, bulge, exactly, watch)
             iterations += found.iterations_count
             x = found.x_mm
         if k < len(chain) - 1:
@@ -82,9 +82,10 @@ def from_flat(
 
 
 def _solve_stiffened(
-    layout: Layout, x_mm: Reals, stiffening: float, bulge_mm: Reals | None, exactly: bool, watch: Watch | None
-) -> Equilibrium:
-    """Return the equilibrium with bending `stiffening` times as stiff.
+    system: System, layout: Layout, x_mm: Reals, stiffening: float, bulge_mm: Reals | None, exactly: bool,
+    watch: Watch | None,
+) -> Equilibrium:  # fmt: skip
+    """Return the equilibrium with bending `stiffening` times as stiff as the layout's; `system` lends its pattern.
 
     While it is far stiffer than it should be, the folds of `bulge_mm` are its rest: a sheet too stiff to buckle would
     otherwise forget to which side it was pushed.
@@ -93,7 +94,7 @@ def _solve_stiffened(
     if bulge_mm is not None and stiffening >= REMEMBERED_STIFFENING:
         shell = replace(shell, rest_angle_rad=fold_angles(bulge_mm, shell.hinges))
     tolerance = TOLERANCE_RATIO if exactly else COARSE_TOLERANCE_RATIO
-    return solve(System(shell), x_mm, tolerance_ratio=tolerance, watch=_seer(layout, watch))
+    return solve(system.of(shell), x_mm, tolerance_ratio=tolerance, watch=_seer(layout, watch))
 
 
 def _seer(layout: Layout, watch: Watch | None) -> Callable[[int, Reals, float], None] | None:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.deploy.levels import Layout, prolong, refine
-from design.deploy.newton import Equilibrium, System, solve
-from design.deploy.shell import Ints, Reals
+from design.deploy.newton import Equilibrium, System, smallest_eigenvalue_N_mm, solve
+from design.deploy.shell import Ints, Reals, neighbours
 from design.errors import NotConverged
 
 CONTACT_RATIO = 20.0  # stiffness of a contact point over median k_d: it sinks in by a thousandth of a millimetre or so
@@ -29,6 +29,9 @@ class Response:
     direction: tuple[float, float, float]  # unit vector into the surface
     residual_ratio: float  # the worst of all equilibria of the curve
     recovered_mm: float  # the furthest any vertex stays from where it began, after release
+    iterations_count: int  # of all equilibria of the curve
+    unstable_count: int  # equilibria that a small disturbance would leave; 0 where the curve can be followed
+    smallest_eigenvalue_N_mm: float  # at the greatest depth
 
     def stiffness_N_mm(self, depth_mm: float) -> float:
         """Return the secant stiffness of loading to `depth_mm`."""
@@ -71,12 +74,28 @@ class Sphere:
 
 def border(cells: Ints, vertex_count: int) -> NDArray[np.bool_]:
     """Return which vertices lie on the rim, `(n,)`."""
-    from design.deploy.shell import neighbours
-
     unit, corner = np.nonzero(neighbours(cells) < 0)
     rim = np.zeros(vertex_count, dtype=bool)
     rim[cells[unit, (corner + 1) % 3]] = rim[cells[unit, (corner + 2) % 3]] = True
     return rim
+
+
+def standing_rim(cells: Ints, x_mm: Reals) -> NDArray[np.bool_]:
+    """Return the vertices `(n,)` of the rims that a sheet stands on: those below its middle height, all if none is.
+
+    A vase stands on its foot and not on its lip, a pierced cap not on its hole.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    unit, corner = np.nonzero(neighbours(cells) < 0)
+    start, end = cells[unit, (corner + 1) % 3], cells[unit, (corner + 2) % 3]
+    graph = coo_matrix((np.ones(len(start)), (start, end)), shape=(len(x_mm), len(x_mm)))
+    _, loop = connected_components(graph, directed=False)
+    rim = border(cells, len(x_mm))
+    middle = 0.5 * (x_mm[:, 2].min() + x_mm[:, 2].max())
+    low = [k for k in np.unique(loop[rim]) if x_mm[loop == k, 2].mean() < middle]
+    return np.asarray(rim & np.isin(loop, low) if low else rim)
 
 
 def first_contact(x_mm: Reals, point_mm: Reals, direction: Reals, radius_mm: float) -> float:
@@ -102,7 +121,7 @@ def indentation_response(
     parts: int | None = None,
     watch: Callable[[float], None] | None = None,
 ) -> Response:
-    """Return the load of a rigid sphere pressed to `depth_max_mm` at a point and drawn back, rim held.
+    """Return the load of a rigid sphere pressed to `depth_max_mm` at a point and drawn back, its lower rim held.
 
     `x_mm` is the deployed equilibrium of `layout`. The point is by default the highest against `direction`. Each unit
     is divided into `parts`² triangles (by default until there are about 1,500), because the footprint is smaller than
@@ -119,14 +138,18 @@ def indentation_response(
     foot = x[int(np.argmin(x @ way))] if point_mm is None else np.asarray(point_mm, float)
     start = first_contact(x, foot, way, indenter_radius_mm)
     foot = foot + start * way
-    rim = border(fine.cells, fine.vertex_count)
+    rim = standing_rim(fine.cells, x)
     stiffness = np.full(fine.vertex_count, CONTACT_RATIO * float(np.median(system.shell.dilation_N_mm)))
     depths = np.linspace(0.0, depth_max_mm, steps_count + 1)
     loads: list[float] = []
-    worst, begin, before = 0.0, x, x
+    worst, begin, before, iterations, unstable, softest = 0.0, x, x, 0, 0, np.nan
+    fixed = np.repeat(rim[:, None], 3, axis=1)
     for k, depth in enumerate([*depths, *depths[::-1]]):
         ball = Sphere(foot + (depth - indenter_radius_mm) * way, indenter_radius_mm, stiffness)
-        found = _pressed(system, ball, rim, x, before)
+        found = _pressed(system, ball, fixed, x, before)
+        iterations, unstable = iterations + found.iterations_count, unstable + (not found.stable)
+        if k == len(depths) - 1:
+            softest = smallest_eigenvalue_N_mm(system, found.x_mm, [ball], fixed)
         x, before, worst = found.x_mm, x, max(worst, found.residual_ratio)
         loads.append(float(ball.force_N(x) @ -way))
         if watch is not None:
@@ -135,15 +158,17 @@ def indentation_response(
     half = len(depths)
     there, again = np.array(loads[:half]), np.array(loads[half:])[::-1]
     point, into = (float(foot[0]), float(foot[1]), float(foot[2])), (float(way[0]), float(way[1]), float(way[2]))
-    return Response(depths, there, again, indenter_radius_mm, point, into, worst, back)
+    return Response(
+        depths, there, again, indenter_radius_mm, point, into, worst, back, iterations, unstable, softest
+    )  # fmt: skip
 
 
-def _pressed(system: System, ball: Sphere, rim: NDArray[np.bool_], x: Reals, before: Reals) -> Equilibrium:
+def _pressed(system: System, ball: Sphere, fixed: NDArray[np.bool_], x: Reals, before: Reals) -> Equilibrium:
     """Return the rest under the sphere, first from where the last two steps point, then from the last."""
     try:
-        return solve(system, 2 * x - before, [ball], np.repeat(rim[:, None], 3, axis=1), iterations_max=15)
+        return solve(system, 2 * x - before, [ball], fixed, iterations_max=15)
     except NotConverged:
-        return solve(system, x, [ball], np.repeat(rim[:, None], 3, axis=1))
+        return solve(system, x, [ball], fixed)
 
 
 def _on_top_of(source_mm: Reals, goal_mm: Reals, all_mm: Reals) -> Reals:

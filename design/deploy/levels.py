@@ -161,7 +161,9 @@ def levels(layout: Layout) -> list[Layout]:
 def prolong(coarse: Layout, x_mm: Reals, fine: Layout) -> Reals:
     """Return start positions `(n, 3)` of the fine sheet on the coarse one's shape.
 
-    Barycentric in the nearest coarse unit and not clipped, so that vertices beyond the coarse outline continue it.
+    Each coarse unit is a quadratic patch through its corners, bent as its corners' normals ask (after the curved
+    triangles of Vlachos et al. 2001): facets would crease the fine sheet along every coarse side. Barycentric and not
+    clipped, so that vertices beyond the coarse outline continue the nearest patch.
     """
     from scipy.spatial import cKDTree
 
@@ -173,7 +175,22 @@ def prolong(coarse: Layout, x_mm: Reals, fine: Layout) -> Reals:
     v = (p[:, 0] * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * p[:, 1]) / det
     w = ((b[:, 0] - a[:, 0]) * p[:, 1] - p[:, 0] * (b[:, 1] - a[:, 1])) / det
     weights = np.column_stack([1 - v - w, v, w])
-    return np.asarray(np.einsum("nk,nkd->nd", weights, x_mm[coarse.cells[nearest]]))
+    corners, normals = (field[coarse.cells[nearest]] for field in (x_mm, _normals(coarse.cells, x_mm)))
+    places = np.einsum("nk,nkd->nd", weights, corners)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        side = corners[:, j] - corners[:, i]
+        rise_i, rise_j = (np.sum(side * normals[:, k], axis=1, keepdims=True) for k in (i, j))
+        bow = rise_i * normals[:, i] - rise_j * normals[:, j]
+        places -= 0.5 * (weights[:, i] * weights[:, j])[:, None] * bow
+    return np.asarray(places)
+
+
+def _normals(cells: Ints, x_mm: Reals) -> Reals:
+    """Return the unit normal at each vertex `(n, 3)`, of its units by their area."""
+    a, b, c = (x_mm[cells[:, k]] for k in range(3))
+    each = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    total = np.column_stack([np.bincount(cells.ravel(), each[:, d], len(x_mm)) for d in range(3)])
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))
 
 
 def refine(layout: Layout, parts: int) -> Layout:

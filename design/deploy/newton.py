@@ -1,11 +1,12 @@
 """Find an equilibrium: Newton's method with the exact Hessian and a shift that grows only while it must.
 
-A factorisation with a negative pivot means the energy is not convex there; the Hessian is then shifted until it is.
+A Hessian without a Cholesky factor means that the energy is not convex there; it is then shifted until it has one.
 The last factorisation, unshifted, tells whether the equilibrium is stable.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -17,6 +18,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from design.deploy import kernels
 from design.deploy.factor import Factor, factorise
+from design.deploy.fronts import Cholesky, Front, cholesky, planned
 from design.deploy.shell import Ints, Reals, Shell
 from design.errors import NotConverged
 
@@ -80,6 +82,13 @@ class System:
         for c in range(3):
             self._indices[(base + c * self.stride[row])[:, None] + inner] = columns
         self._owner = np.repeat(np.arange(3 * n, dtype=np.int32), np.diff(self._indptr))
+        self._fronts: list[Front] = []
+
+    def of(self, shell: Shell) -> System:
+        """Return the system of another shell of the same units: what is known of the pattern is kept."""
+        other = copy.copy(self)
+        other.shell = shell
+        return other
 
     def energy(self, x_mm: Reals, loads: Sequence[Load] = ()) -> float:
         """Return the whole energy, mJ."""
@@ -134,6 +143,15 @@ class System:
         data[diagonal[flat]] = float(np.median(self.shell.dilation_N_mm))
         return self._matrix(data)
 
+    def cholesky(self, matrix: sp.csc_matrix, x_mm: Reals) -> Cholesky | None:
+        """Return the factorisation of a matrix of this pattern, None where it is not positive.
+
+        The order is planned once, by where the vertices are at that time; that only decides how fast it is.
+        """
+        if not self._fronts:
+            self._fronts.extend(planned(self._indptr.astype(np.int64), self._indices.astype(np.int64), x_mm))
+        return cholesky(self._fronts, matrix.data)
+
     def shifted(self, hessian: sp.csc_matrix, shift_N_mm: float) -> sp.csc_matrix:
         """Return the Hessian plus a multiple of the identity."""
         data = hessian.data.copy()
@@ -141,15 +159,12 @@ class System:
         return self._matrix(data)
 
 
-def _convex(system: System, matrix: sp.csc_matrix, shift: float, first_shift: float) -> tuple[Factor, float]:
+def _convex(system: System, matrix: sp.csc_matrix, x: Reals, shift: float, first_shift: float) -> tuple[Factor, float]:
     """Return the factorisation of the matrix shifted as little as makes it positive, and that shift."""
     while True:
-        try:
-            lu, negative = factorise(system.shifted(matrix, shift) if shift else matrix)
-        except RuntimeError:  # a zero pivot: a soft direction, such as a sheet that slides on a floor
-            negative = 1
-        if negative == 0:
-            return lu, shift
+        found = system.cholesky(system.shifted(matrix, shift) if shift else matrix, x)
+        if found is not None:
+            return found, shift
         shift = max(4 * shift, first_shift)
 
 
@@ -199,14 +214,14 @@ def solve(
             watch(iteration, x, residual)
         matrix = system.held(hessian, hold)
         if residual <= tolerance_ratio:
-            if settled or factorise(matrix)[1] == 0:
+            if settled or system.cholesky(matrix, x) is not None:
                 return Equilibrium(x, energy, residual, iteration, 0)
             x = x + _way_down(matrix, gradient.shape, hold) * 0.05 * system.shell.edge_mm
             continue
         if iteration == iterations_max:
             break
-        lu, shift = _convex(system, matrix, shift, first_shift)
-        step = -lu.solve(gradient.ravel()).reshape(x.shape)
+        factor, shift = _convex(system, matrix, x, shift, first_shift)
+        step = -factor.solve(gradient.ravel()).reshape(x.shape)
         step[hold] = 0.0
         step *= min(1.0, longest / max(float(np.linalg.norm(step, axis=1).max()), 1e-300))
         length = _line_search(system, x, step, loads, energy, float(np.sum(gradient * step)))
@@ -241,10 +256,9 @@ def _line_search(
     return 0.0
 
 
-def lowest_modes(matrix: sp.csc_matrix, count: int = 1) -> tuple[Reals, Reals]:
+def lowest_modes(matrix: sp.csc_matrix, count: int = 1, factor: Factor | None = None) -> tuple[Reals, Reals]:
     """Return the eigenvalues nearest below or around zero, ascending, N/mm, and their vectors `(3n, count)`."""
-    lu = factorise(matrix)[0]
-    inverse = LinearOperator(matrix.shape, matvec=lu.solve, dtype=float)
+    inverse = LinearOperator(matrix.shape, matvec=(factor or factorise(matrix)[0]).solve, dtype=float)
     start = np.random.default_rng(7).standard_normal(matrix.shape[0])
     values, vectors = eigsh(matrix, k=count, sigma=0.0, OPinv=inverse, v0=start, which="LM")
     order = np.argsort(values)
@@ -265,7 +279,7 @@ def smallest_eigenvalue_N_mm(
     """Return the smallest eigenvalue in magnitude of the Hessian on the free degrees of freedom (signed)."""
     hold = pins(x_mm) if fixed is None else fixed
     matrix = system.held(system.linearise(x_mm, loads)[2], hold)
-    return float(lowest_modes(matrix, 1)[0][0])
+    return float(lowest_modes(matrix, 1, system.cholesky(matrix, x_mm))[0][0])
 
 
 def fold_angles(x_mm: Reals, hinges: Ints) -> Reals:

@@ -21,14 +21,14 @@ def deployment(
     Followed backwards from the deployed shape, which is unambiguous; units that snap one by one pass through other
     shapes. Ends early where the shrinking sheet finds no rest (the frames before it are returned).
     """
-    frames = [x_mm]
+    frames, system = [x_mm], System(layout.shell())
     shares = np.linspace(1.0, 0.0, frames_count)[1:]
     for k, share in enumerate(shares):
         smaller = replace(layout, expansion_ratio=1 + share * (layout.expansion_ratio - 1))
         shrink = float(np.mean(smaller.expansion_ratio)) / _mean_stretch(layout, frames[-1])
         middle = frames[-1].mean(axis=0)
         try:
-            found = solve(System(smaller.shell()), middle + shrink * (frames[-1] - middle), tolerance_ratio=1e-7)
+            found = solve(system.of(smaller.shell()), middle + shrink * (frames[-1] - middle), tolerance_ratio=1e-7)
         except NotConverged:
             break
         frames.append(_laid(found.x_mm, frames[-1]))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from design.deploy.compare import kabsch
-from design.deploy.equilibrium import from_flat, pushed_flat, solve_level
+from design.deploy.equilibrium import from_flat, pushed_flat, rolled, solve_level
 from design.deploy.levels import Layout
 from design.deploy.newton import Equilibrium
 from design.deploy.shell import Ints, Reals, neighbours
@@ -18,6 +18,7 @@ from design.errors import NotConverged
 BUMP_HEIGHT_RATIO = 0.5  # of a bump's width: how far it is pushed through, well past flat
 SMALLEST_BUMP_COUNT = 4  # units
 MOST_BUMPS_COUNT = 12  # the largest ones are turned over
+LARGE_BUMP_RATIO = 0.25  # of the largest one's units: a second bump smaller than that is not turned over
 SAME_RATIO = 0.01  # of the sheet's size, RMS after alignment: nearer than that is the same shape
 
 
@@ -30,7 +31,12 @@ class Found:
 
 
 def starts(layout: Layout, count: int, seed: int) -> dict[str, Callable[[Layout], Reals]]:
-    """Return named starts: up, down, and `count` random gentle bulges of the flat sheet, repeatable by `seed`."""
+    """Return named starts: up, down, and `count` random gentle bulges of the flat sheet, repeatable by `seed`.
+
+    A sheet with a re-joined seam starts as a cylinder, either side out.
+    """
+    if layout.rejoined_count():
+        return {"rolled": rolled, "rolled inside out": functools.partial(rolled, outward=-1.0)}
     named: dict[str, Callable[[Layout], Reals]] = {
         "up": lambda level: pushed_flat(level, 0.3),
         "down": lambda level: pushed_flat(level, -0.3),
@@ -88,10 +94,25 @@ def turned_over(layout: Layout, x_mm: Reals, bump: Ints, side: float) -> Reals:
 
 def _designed_starts(layout: Layout, design_mm: Reals) -> dict[str, Reals]:
     """Return the intended shape, and the same with one bump after the other pushed to either side."""
-    named = {"designed": design_mm}
-    for k, bump in enumerate(bumps(layout)):
-        for side, word in ((1.0, "up"), (-1.0, "down")):
-            named[f"designed, bump {k + 1} {word}"] = turned_over(layout, design_mm, bump, side)
+    return {"designed": design_mm, **_turnings(layout, design_mm, bumps(layout), "designed, bump")}
+
+
+def _turnings(layout: Layout, x_mm: Reals, places: list[Ints], name: str) -> dict[str, Reals]:
+    return {
+        f"{name} {k + 1} {word}": turned_over(layout, x_mm, bump, side)
+        for k, bump in enumerate(places)
+        for side, word in ((1.0, "up"), (-1.0, "down"))
+    }
+
+
+def _second_turnings(layout: Layout, found: list[Found]) -> dict[str, Reals]:
+    """Return every shape that a bump turned over has led to, with each large bump turned over as well."""
+    places = bumps(layout)
+    large = [bump for bump in places if len(bump) >= LARGE_BUMP_RATIO * len(places[0])]
+    named: dict[str, Reals] = {}
+    for one in found:
+        if one.starts[0].startswith("designed, bump"):
+            named |= _turnings(layout, one.equilibrium.x_mm, large, f"{one.starts[0]}, then bump")
     return named
 
 
@@ -104,24 +125,30 @@ def equilibria(
 ) -> tuple[list[Found], list[str]]:
     """Return the different stable equilibria found, lowest energy first, and the starts that led nowhere.
 
-    Starts are the designed shape (where its points `(n, 3)` are given), the same with each bump turned over, and those
-    of `starts`. A shape and its mirror
+    Starts are the designed shape (where its points `(n, 3)` are given), the same with each bump turned over, those
+    of `starts`, and the shapes so found by turning a bump over with a second bump turned over. A shape and its mirror
     image are two, unless turning makes them one.
     """
     found: list[Found] = []
     lost: list[str] = []
+
+    def look(ways: Mapping[str, Callable[[], Equilibrium]], begin: float, end: float) -> None:
+        for k, (name, way) in enumerate(ways.items()):
+            try:
+                _keep(found, way(), name)
+            except NotConverged as fault:
+                lost.append(f"{name}: {fault}")
+            if watch is not None:
+                watch(begin + (end - begin) * (k + 1) / len(ways), name)
+
+    def from_shapes(named: dict[str, Reals]) -> dict[str, Callable[[], Equilibrium]]:
+        return {name: functools.partial(solve_level, layout, x) for name, x in named.items()}
+
     near = {} if design_mm is None else _designed_starts(layout, design_mm)
-    ways: dict[str, Callable[[], Equilibrium]] = {
-        name: functools.partial(solve_level, layout, x) for name, x in near.items()
-    }
-    ways |= {name: functools.partial(from_flat, layout, start) for name, start in starts(layout, count, seed).items()}
-    for k, (name, way) in enumerate(ways.items()):
-        try:
-            _keep(found, way(), name)
-        except NotConverged as fault:
-            lost.append(f"{name}: {fault}")
-        if watch is not None:
-            watch((k + 1) / len(ways), name)
+    flat = {name: functools.partial(from_flat, layout, start) for name, start in starts(layout, count, seed).items()}
+    look(from_shapes(near), 0.0, 0.4)
+    look(flat, 0.4, 0.7)
+    look(from_shapes(_second_turnings(layout, found)), 0.7, 1.0)
     return sorted(found, key=lambda one: one.equilibrium.energy_mJ), lost
 
 

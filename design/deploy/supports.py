@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.cells.sheet import Sheet
-from design.deploy.indentation import CONTACT_RATIO, border
+from design.deploy.indentation import CONTACT_RATIO, standing_rim
 from design.deploy.levels import Layout
-from design.deploy.newton import Equilibrium, Load, System, solve
+from design.deploy.newton import Equilibrium, Load, System, smallest_eigenvalue_N_mm, solve
 from design.deploy.shell import Reals
 from design.errors import NotConverged
 
@@ -114,6 +114,7 @@ class Settled:
     worst_mm: float  # the furthest any vertex moves
     standing_count: int  # vertices that the floor carries or that are held
     slid_mm: float  # the furthest a standing vertex slid
+    smallest_eigenvalue_N_mm: float  # of the loaded sheet on its support
 
 
 def weight_of(layout: Layout, sheet: Sheet) -> Weight:
@@ -145,11 +146,11 @@ def settle(
         raise ValueError("a sheet with weight needs a support")
     system = System(layout.shell())
     whole = weight_of(layout, sheet)
-    rim = border(layout.cells, layout.vertex_count)
+    rim = standing_rim(layout.cells, x_mm)
     lowest = float(x_mm[:, 2].min())
     height = np.where(rim & bedded, x_mm[:, 2], lowest)
     floor = Floor(height, CONTACT_RATIO * float(np.median(system.shell.dilation_N_mm)))
-    fixed = _level_pins(x_mm)
+    fixed = level_pins(x_mm)
     ratio = {"held": 0.0, "no-slip": NO_SLIP, "slip": 0.0, "coulomb": friction_ratio}[support]
     standing = x_mm[:, 2] <= height
     share_N = float(whole.force_N.sum()) / steps_count / max(int(standing.sum()), 1)
@@ -166,6 +167,7 @@ def settle(
         x = found.x_mm
         if watch is not None:
             watch(step / steps_count)
+    held = np.zeros_like(fixed) if ratio and np.sum(friction.limit_N > 0) > 2 else fixed
     carried = rim if support == "held" else floor.force_N(x) > 0
     slid = np.linalg.norm((x - x_mm)[carried, :2], axis=1)
     top = int(np.argmax(x_mm[:, 2]))
@@ -177,10 +179,11 @@ def settle(
         float(np.linalg.norm(x - x_mm, axis=1).max()),
         int(carried.sum()),
         float(slid.max()) if len(slid) else 0.0,
+        smallest_eigenvalue_N_mm(system, x, loads if ratio == 0 else [*loads, friction], held),
     )
 
 
-def _level_pins(x: Reals) -> NDArray[np.bool_]:
+def level_pins(x: Reals) -> NDArray[np.bool_]:
     """Return degrees of freedom that stop drifting and turning over a level floor, and nothing else.
 
     Without friction nothing else would; with it they carry no force, as the pull of friction sums to zero.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from design.errors import FlattenError
 from design.findings import Finding
-from design.surface import Indices, TriMesh, corner_fans
+from design.surface import Indices, TriMesh, boundary_loops, corner_fans
 
 Values = NDArray[np.float64]
 
@@ -102,3 +103,38 @@ def shortest_chain(
     while not is_start[chain[-1]]:
         chain.append(int(before[chain[-1]]))
     return np.array(chain[::-1], dtype=np.int64)
+
+
+def chain_through(mesh: TriMesh, points_mm: NDArray[np.float64]) -> Indices:
+    """Return the chain of vertices along which to cut, from the rim through places on the surface, `(k, 3)`.
+
+    The first place is taken to the nearest vertex of the rim, and so is the last where it lies within an edge or so of
+    the rim; others go to their nearest vertex. Raises `FlattenError` where such a cut parts the surface.
+    """
+    loops = boundary_loops(mesh)
+    rim = np.concatenate(loops)
+    near = near_mm(mesh)
+    stops = [_nearest(mesh, points_mm[0], rim)]
+    for number, point in enumerate(points_mm[1:], start=2):
+        at_rim = _nearest(mesh, point, rim)
+        is_end = number == len(points_mm) and np.linalg.norm(mesh.vertices_mm[at_rim] - point) < near
+        stops.append(at_rim if is_end else _nearest(mesh, point, np.arange(len(mesh.vertices_mm))))
+    homes = [next((k for k, loop in enumerate(loops) if stop in loop), -1) for stop in stops]
+    chain = np.array(stops[:1])
+    for a, b in pairwise(stops):
+        piece = shortest_chain(mesh, np.array([a]), np.array([b]), np.concatenate([rim, chain[:-1]]))
+        chain = np.concatenate([chain, piece[1:]])
+    if len(chain) < 2 or homes[0] == homes[-1] or any(home >= 0 for home in homes[1:-1]):
+        text = "it must lead from the rim inwards, or from one rim to another, and meet no rim between"
+        raise FlattenError("the surface cannot be cut there", [Finding("CUT-PATH", text)])
+    return chain
+
+
+def near_mm(mesh: TriMesh) -> float:
+    """Return one and a half of the mesh's usual edge."""
+    a, b = mesh.vertices_mm[mesh.faces], mesh.vertices_mm[np.roll(mesh.faces, -1, axis=1)]
+    return 1.5 * float(np.median(np.linalg.norm(a - b, axis=2)))
+
+
+def _nearest(mesh: TriMesh, point_mm: NDArray[np.float64], among: Indices) -> int:
+    return int(among[np.argmin(np.linalg.norm(mesh.vertices_mm[among] - point_mm, axis=1))])

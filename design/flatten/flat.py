@@ -12,6 +12,7 @@ from design.findings import Finding, errors
 from design.flatten.cones import place_cones, seams_of
 from design.flatten.cut import Cut, cut_along
 from design.flatten.disk import disk, lay_out, rim_u
+from design.flatten.given import given_flat
 from design.flatten.quality import check_flat, signed_areas_mm2
 from design.flatten.result import Flattening, FlattenOptions, Seam
 from design.flatten.rims import lay_rims, rims, rims_u
@@ -30,6 +31,8 @@ def flatten(mesh: TriMesh, options: FlattenOptions = DEFAULTS) -> Flattening:
     flat. Raises `FlattenError` with all findings where the flat has flipped faces or overlaps itself, whatever is
     tried: fewer boundary modes, filled holes, a Laplacian of better shaped triangles.
     """
+    if options.given_mm is not None:
+        return given_flat(mesh, options.given_mm)
     loops = boundary_loops(mesh)
     if not loops:
         raise FlattenError("the surface is closed; a sheet has an edge")

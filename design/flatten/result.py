@@ -34,6 +34,8 @@ class FlattenOptions:
     `cut_path` is a chain of vertices to cut along: the seam of a tube, or a dart from the rim inwards.
 
     `cones_count` cones are placed where they help most, the rim optimised with them.
+
+    `given_mm` is a flat that is there already, by the corners of each face; it is checked, and nothing is computed.
     """
 
     boundary: Boundary = "isometric"
@@ -44,6 +46,7 @@ class FlattenOptions:
     cut_path: Indices | None = None
     cones_count: int = 0
     laplacian: Laplacian = "cotangent"
+    given_mm: NDArray[np.float64] | None = None  # (m, 3, 2)
 
 
 @dataclass(frozen=True, slots=True)

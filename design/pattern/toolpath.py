@@ -20,6 +20,10 @@ from design.pattern.tiling import Array
 SINGLE_RATIO = 1.25  # a slit up to this many kerfs wide is one pass along its centre line
 MITRE_RATIO = 5.0  # corners sharper than this many half kerfs are cut off
 
+LEAD_SHARES = (1.0, 0.5, 0.25)  # of the lead-in that is asked for, tried in turn
+LEAD_CORNERS_COUNT = 64  # of a ring, at which it may begin
+ROUNDING_MM = 1e-6
+
 Sides = Literal["auto", "single", "both"]
 
 
@@ -84,14 +88,9 @@ def _slit(path: CutPath, options: ToolOptions) -> list[CutPath]:
 
 def _shortened(path: CutPath, by_mm: float) -> Array:
     """Return the slit with `by_mm` taken off its inner ends, which the beam's own radius burns."""
-    points = path.points_mm.copy()
-    for end in (0,) if path.opens else (0, -1):
-        other = 1 if end == 0 else -2
-        arm = points[other] - points[end]
-        length = float(np.linalg.norm(arm))
-        if length > by_mm:
-            points[end] = points[end] + arm * (by_mm / length)
-    return points
+    length = float(np.linalg.norm(np.diff(path.points_mm, axis=0), axis=1).sum())
+    end_mm = length if path.opens else length - by_mm
+    return _between(path.points_mm, by_mm, end_mm) if end_mm > by_mm else path.points_mm
 
 
 def _contour(path: CutPath, waste_side: int, options: ToolOptions) -> list[CutPath]:
@@ -99,15 +98,16 @@ def _contour(path: CutPath, waste_side: int, options: ToolOptions) -> list[CutPa
     rings = _offset(path, waste_side * options.kerf_mm / 2)
     found = []
     for ring in rings:
+        lead = np.zeros((0, 2))
+        if options.lead_in_mm and waste_side and not (options.tabs_count and path.layer == "outline"):
+            ring, lead = _led_into(ring, waste_side, options.lead_in_mm)
         loop = np.vstack([ring, ring[:1]])
         if options.tabs_count and path.layer == "outline":
             found += [replace(path, points_mm=piece, closed=False) for piece in _tabbed(loop, options)]
             continue
         if options.overcut_mm:
             loop = np.vstack([loop, _first_mm(loop, options.overcut_mm)[1:]])
-        if options.lead_in_mm and waste_side:
-            loop = np.vstack([_lead_in(ring, waste_side, options.lead_in_mm), loop])
-        found.append(replace(path, points_mm=loop, closed=False))
+        found.append(replace(path, points_mm=np.vstack([lead, loop]), closed=False))
     return found
 
 
@@ -126,6 +126,24 @@ def _offset(path: CutPath, offset_mm: float) -> list[Array]:
     counter_clockwise = signed_area_mm2(path.points_mm) > 0
     rings = [np.asarray(part.exterior.coords)[:-1] for part in parts]
     return [ring if (signed_area_mm2(ring) > 0) == counter_clockwise else ring[::-1] for ring in rings]
+
+
+def _led_into(ring_mm: Array, waste_side: int, length_mm: float) -> tuple[Array, Array]:
+    """Return the ring from the corner on which its lead-in keeps to the waste, and where that begins, `(1, 2)`.
+
+    Where the waste is too narrow everywhere the lead-in is shorter, and at last none, `(0, 2)`.
+    """
+    area = shapely.Polygon(ring_mm)
+    step = max(1, len(ring_mm) // LEAD_CORNERS_COUNT)
+    for share in LEAD_SHARES:
+        for corner in range(0, len(ring_mm), step):
+            ring = np.roll(ring_mm, -corner, axis=0)
+            begin = _lead_in(ring, waste_side, share * length_mm)
+            way = shapely.LineString([begin[0], ring[0]])
+            burnt = way.difference(area) if waste_side < 0 else way.intersection(area)
+            if burnt.length < ROUNDING_MM:
+                return ring, begin
+    return ring_mm, np.zeros((0, 2))
 
 
 def _lead_in(ring_mm: Array, waste_side: int, length_mm: float) -> Array:

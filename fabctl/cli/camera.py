@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,16 +9,18 @@ from typing import TYPE_CHECKING
 import click
 
 from fabctl.cli.common import bench_option, json_option, lab, say, show
+from fabctl.cli.paths import RUN, InFile, InFolder, OutFile, PhotoFile, config_names
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from design.pattern.paths import CutPath
     from drivers.camera import Frame
     from fabctl.config.bench import BenchConfig
     from fabctl.vision.boards import Charuco, MarkSheet
 
-PATH = click.Path(path_type=Path)
-FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
-image_option = click.option("--image", type=FILE, help="A picture of the bed, instead of the bench's camera.")
+BOARD = config_names("boards")
+image_option = click.option("--image", type=InFile(), help="A picture of the bed, instead of the bench's camera.")
 
 
 def size(text: str) -> tuple[float, float]:
@@ -83,7 +84,7 @@ def marks(kind: str, size_mm: tuple[float, float], side_mm: float | None, name: 
 
 
 @board.command("measured")
-@click.argument("name")
+@click.argument("name", type=BOARD)
 @click.argument("across_mm", type=float)
 @click.argument("up_mm", type=float)
 @json_option
@@ -112,7 +113,7 @@ def _write_board(made: Charuco | MarkSheet, as_json: bool) -> None:
     strokes = [] if isinstance(made, Charuco) else hatch(sheet_ink(made), 0.1, 0.1)
     files = {kind: folder / f"{made.name}.{kind}" for kind in ("yaml", "pdf", "dxf")}
     write_board(config_of(made), files["yaml"])
-    files["pdf"].write_bytes(pdf(drawing))
+    write_atomically(files["pdf"], pdf(drawing))
     write_atomically(files["dxf"], dxf(drawing, strokes))
     w, h = made.size_mm
     lines = [f"{path}" for path in files.values()]
@@ -123,7 +124,7 @@ def _write_board(made: Charuco | MarkSheet, as_json: bool) -> None:
 
 @command.command("show")
 @bench_option
-@click.option("-o", "--output", type=PATH, default=Path("bed.png"), show_default=True)
+@click.option("-o", "--output", type=PhotoFile(), default=Path("bed.png"), show_default=True)
 @json_option
 def show_picture(bench_name: str, output: Path, as_json: bool) -> None:
     """Take one picture of the bed and say whether it can be measured in."""
@@ -139,18 +140,18 @@ def show_picture(bench_name: str, output: Path, as_json: bool) -> None:
 
 
 @command.command("calibrate")
-@click.argument("pictures", nargs=-1, type=FILE)
-@click.option("--board", "board_name", default="lens", show_default=True, help="Board file or its name.")
+@click.argument("pictures", nargs=-1, type=InFile())
+@click.option("--board", "board_name", type=BOARD, default="lens", show_default=True, help="Board file or its name.")
 @click.option("--views", default=15, show_default=True, help="How many pictures to take from the live camera.")
 @bench_option
 @json_option
 def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_name: str, as_json: bool) -> None:
     """Measure the lens from PICTURES of a ChArUco board, or from the bench's camera."""
-    from drivers.camera import read_picture
     from fabctl.config.boards import load_board
     from fabctl.errors import UsageError
     from fabctl.vision import lens
     from fabctl.vision.bed import lens_path
+    from fabctl.vision.overlay import coverage_map, write_picture
 
     config = load_board(board_name, lab().root)
     if config.kind != "charuco":
@@ -158,7 +159,9 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
     if config.measured_mm is None:
         say(f"{board_name}: not measured after printing; the lens does not mind, distances would")
     bench, state = bench_and_state(bench_name)
-    frames = [read_picture(path) for path in pictures] or _live(bench, state, views)
+    frames = _readable(pictures) if pictures else _live(bench, state, views)
+    if not frames:
+        raise UsageError(f"none of the {len(pictures)} files is a picture that can be read")
     seen = [lens.find_board(frame.image, config.charuco(), frame.source) for frame in frames]
     for _, found in seen:
         for finding in found:
@@ -168,12 +171,17 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
         raise UsageError(f"the pictures have {len(sizes)} sizes; a lens is measured at one")
     h, w = sizes.pop()
     good = [view for view, _ in seen if view is not None]
-    made = lens.calibrate(good, (w, h), config.charuco(), datetime.now(UTC).isoformat())
     path = lens_path(state, bench.camera.calibration if bench.camera else None)
+    drawn = path.with_suffix(".png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(str(drawn), coverage_map(good, (w, h)))
+    say(f"{drawn}: where in the frame the board was seen")
+    made = lens.calibrate(good, (w, h), config.charuco(), datetime.now(UTC).isoformat())
     lens.write_lens(made.lens, path, {"views": dict(zip(made.sources, made.view_rms_px, strict=True))})
     facts = made.lens
     data = {
         "lens": str(path),
+        "picture": str(drawn),
         "views_count": facts.views_count,
         "rms_px": facts.rms_px,
         "repeat_px": facts.repeat_px,
@@ -185,9 +193,13 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
 
 
 @command.command("align")
-@click.option("--marks", "marks_name", default="bed", show_default=True, help="Marks at known machine places.")
+@click.option(
+    "--marks", "marks_name", type=BOARD, default="bed", show_default=True, help="Marks at known machine places."
+)
 @click.option("--offset-mm", type=float, nargs=2, default=None, help="Machine place of the marks' own origin.")
-@click.option("--engraved", metavar="RUN", help="The run of `fabctl cut marks` that engraved them: it knows the place.")
+@click.option(
+    "--engraved", type=RUN, metavar="RUN", help="The run of `fabctl cut marks` that engraved them: it knows the place."
+)
 @click.option("--height-mm", type=float, default=0.0, help="Of the marks over the bed: the sheet's thickness.")
 @image_option
 @bench_option
@@ -235,12 +247,9 @@ def align(
 def _engraved_at(name: str) -> tuple[float, float]:
     """Return where a run of `fabctl cut marks` laid the marks' origin."""
     from fabctl.errors import UsageError
-    from fabctl.records.folder import open_run, status_of
+    from fabctl.records.folder import status_of
 
-    path = lab().runs / name
-    if not path.is_dir():
-        raise UsageError(f"{path}: no such run; `fabctl run list` names them")
-    run = open_run(path)
+    run = lab().run(name)
     if run.manifest().get("kind") != "marks" or status_of(run) != "done":
         raise UsageError(f"{name} is no finished run of `fabctl cut marks`")
     (_, _, x), (_, _, y) = run.manifest()["config"]["placement"]
@@ -266,10 +275,12 @@ def check(image: Path | None, bench_name: str, as_json: bool) -> None:
 
 
 @command.command("register")
-@click.option("--sheet", "sheet_name", default="registration", show_default=True, help="The sheet's marks.")
+@click.option("--sheet", "sheet_name", type=BOARD, default="registration", show_default=True, help="The sheet's marks.")
 @click.option("--thickness-mm", type=float, required=True, help="The sheet's: its marks lie that far over the bed.")
-@click.option("--design", type=PATH, default=None, help="Design folder whose job is drawn and checked.")
-@click.option("-o", "--output", type=PATH, default=Path("registration.json"), show_default=True)
+@click.option("--design", type=InFolder(), default=None, help="Design folder whose job is drawn and checked.")
+@click.option(
+    "-o", "--output", type=OutFile((".json",), "a registration"), default=Path("registration.json"), show_default=True
+)
 @image_option
 @bench_option
 @json_option
@@ -306,14 +317,9 @@ def register(
 def read_paths(path: Path) -> tuple[CutPath, ...]:
     """Return the strokes of a design folder's `paths.json`."""
     from design.pattern.drawing import from_json
-    from fabctl.errors import BundleError
+    from fabctl.files import json_of
 
-    try:
-        return from_json(json.loads(path.read_text(encoding="utf-8"))).paths
-    except OSError as fault:
-        raise BundleError(f"{path}: {fault.strerror}") from fault
-    except ValueError as fault:
-        raise BundleError(f"{path}: not JSON: {fault}") from fault
+    return from_json(json_of(path, "the paths.json of a design folder")).paths
 
 
 def bench_and_state(name: str) -> tuple[BenchConfig, Path]:
@@ -326,9 +332,24 @@ def bench_and_state(name: str) -> tuple[BenchConfig, Path]:
 
 def bed_picture(bench_name: str, image: Path | None) -> Frame:
     """Return the picture in the file, or a fresh one from the bench's camera."""
-    from drivers.camera import read_picture, snapshot
+    from drivers.camera import snapshot
+    from fabctl.files import picture_of
 
-    return read_picture(image) if image is not None else snapshot(_camera_url(*bench_and_state(bench_name)))
+    return picture_of(image) if image is not None else snapshot(_camera_url(*bench_and_state(bench_name)))
+
+
+def _readable(pictures: Iterable[Path]) -> list[Frame]:
+    """Return the pictures that can be read; name the others."""
+    from fabctl.errors import UsageError
+    from fabctl.files import picture_of
+
+    frames = []
+    for path in pictures:
+        try:
+            frames.append(picture_of(path))
+        except UsageError as fault:
+            say(f"left out: {fault}")
+    return frames
 
 
 def _camera_url(bench: BenchConfig, state: Path) -> str:

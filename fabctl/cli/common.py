@@ -14,16 +14,26 @@ from typing import Any, TypeVar
 
 import click
 
-from fabctl.cli.refusal import answer_no, exit_code_of, plain, refusal, sentence_of
-from fabctl.errors import BUG, DONE, OPERATOR
+from fabctl.cli.paths import config_names
+from fabctl.cli.refusal import answer_no, exit_code_of, no_in_words, plain, refusal, sentence_of
+from fabctl.errors import BUG, DONE, OPERATOR, Stopped
 from fabctl.events import Emit, Event
 from fabctl.workspace import Workspace, workspace
 
+ERASE_TO_END = "\x1b[K"  # of the terminal's line, from the cursor
 F = TypeVar("F", bound=Callable[..., Any])
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 yes_option = click.option("--yes", is_flag=True, help="Answer every question with yes (for scripts).")
-bench_option = click.option("--bench", "bench_name", default="sim", show_default=True, help="Bench file or its name.")
+bench_option = click.option(
+    "--bench",
+    "bench_name",
+    type=config_names("benches"),
+    default="sim",
+    show_default=True,
+    help="Bench file or its name.",
+)
+MATERIAL = config_names("materials")
 
 
 def lab() -> Workspace:
@@ -33,7 +43,20 @@ def lab() -> Workspace:
 
 def say(text: str = "") -> None:
     """Tell the person something; standard error, so that standard output stays for results."""
+    _clear_line()
     click.echo(text, err=True)
+
+
+def _clear_line() -> None:
+    """Take away what a live line of progress has left: its cursor waits at the line's beginning."""
+    if sys.stderr.isatty():
+        click.echo(ERASE_TO_END, err=True, nl=False)
+
+
+def say_keys(text: str) -> None:
+    """Name the keys that act while a job runs, where there is a keyboard."""
+    if sys.stdin.isatty():
+        say(text)
 
 
 def show(data: dict[str, Any], as_json: bool, lines: Iterable[str], code: int = DONE, why: str = "") -> None:
@@ -43,7 +66,10 @@ def show(data: dict[str, Any], as_json: bool, lines: Iterable[str], code: int = 
     """
     if as_json:
         click.echo(_json(data if code == DONE else answer_no(data, code, why)))
+        for line in no_in_words(data, why) if code != DONE else ():
+            say(line)
     else:
+        _clear_line()
         for line in lines:
             click.echo(line)
     if code != DONE:
@@ -66,7 +92,11 @@ def confirm(question: str, yes: bool) -> bool:
     if not sys.stdin.isatty():
         say(f"{question} no (not a terminal; --yes answers yes)")
         return False
-    return click.confirm(question, default=False, err=True)
+    _clear_line()
+    try:
+        return click.confirm(question, default=False, err=True)
+    except click.exceptions.Abort:  # Ctrl-C or Ctrl-D at the question is an answer
+        raise Stopped("stopped at the question; nothing was begun") from None
 
 
 def progress() -> Emit:
@@ -78,13 +108,12 @@ def progress() -> Emit:
         if event.kind == "progress" and event.done_frac is not None:
             text = f"{event.done_frac:6.1%}  {event.message}"
             if live:
-                click.echo(f"\r\x1b[2K{text}", err=True, nl=False)
+                click.echo(f"{ERASE_TO_END}{text}\r", err=True, nl=False)
             elif int(event.done_frac * 10) != tenth[0]:
                 click.echo(text, err=True)
             tenth[0] = int(event.done_frac * 10)
         elif event.kind in ("stage", "state", "warning", "finding"):
-            lead = "\r\x1b[2K" if live else ""
-            click.echo(f"{lead}{event.message}", err=True)
+            say(event.message)
 
     return listen
 
@@ -137,6 +166,7 @@ def _report(fault: BaseException) -> int:
     elif isinstance(fault, click.ClickException):
         fault.show()
     elif code == BUG:
+        _clear_line()
         traceback.print_exception(fault, file=sys.stderr)
         say("fabctl: this is a bug in fabctl; please report it with the lines above")
     else:

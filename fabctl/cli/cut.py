@@ -7,9 +7,10 @@ from typing import Any
 
 import click
 
-from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
 from fabctl.cli.cut_camera import marks_command
 from fabctl.cli.cut_inspect import inspect_command
+from fabctl.cli.paths import RUN, InFile, InFolder, config_names
 
 
 @click.group("cut", no_args_is_help=True)
@@ -22,8 +23,8 @@ command.add_command(marks_command)
 
 
 @command.command("run")
-@click.argument("design", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("--material", help="Material file or its name  [the design's own].")
+@click.argument("design", type=InFolder())
+@click.option("--material", type=MATERIAL, help="Material file or its name  [the design's own].")
 @click.option("--sheet", type=click.IntRange(1), help="Sheet to cut, of a design that is split over several.")
 @click.option(
     "--origin",
@@ -32,14 +33,20 @@ command.add_command(marks_command)
     show_default=True,
     help="Where the sheet's corner is: in the corner of the travel, where the head is, or as the camera sees it.",
 )
-@click.option("--marks", default="registration", show_default=True, help="With --origin camera: the sheet's marks.")
+@click.option(
+    "--marks",
+    type=config_names("boards"),
+    default="registration",
+    show_default=True,
+    help="With --origin camera: the sheet's marks.",
+)
 @click.option("--at-mm", type=float, nargs=2, default=(0.0, 0.0), help="Where on that sheet the design's corner lies.")
-@click.option("--image", type=click.Path(dir_okay=False, path_type=Path), help="A picture of the bed as it is now.")
-@click.option("--camera-file", type=click.Path(dir_okay=False, path_type=Path), help="Sheet to machine map, JSON.")
+@click.option("--image", type=InFile(), help="A picture of the bed as it is now.")
+@click.option("--camera-file", type=InFile(), help="Sheet to machine map, JSON.")
 @click.option("--frame", is_flag=True, help="Go once around the job first, and ask whether it fits.")
 @click.option("--frame-power", type=click.FloatRange(0, 0.05), default=0.0, help="Beam while framing, at most 5 %.")
 @click.option("--no-home", is_flag=True, help="Trust the position as it is; do not home first.")
-@click.option("--resume", "resume_run", metavar="RUN", help="Go on with an interrupted run of this design.")
+@click.option("--resume", "resume_run", type=RUN, metavar="RUN", help="Go on with an interrupted run of this design.")
 @click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
 @bench_option
 @yes_option
@@ -62,7 +69,10 @@ def run(
     yes: bool,
     as_json: bool,
 ) -> None:
-    """Cut the design in folder DESIGN: plan, check, one question, then cut; a run record either way."""
+    """Cut the design in folder DESIGN: plan, check, one question, then cut.
+
+    A run record is kept whatever comes of it, also of a refusal or a no; of a dry run none.
+    """
     from dataclasses import replace
 
     from fabctl.bench import open_bench
@@ -74,6 +84,8 @@ def run(
     from fabctl.cut.keyboard import HELP, keyboard
 
     home = lab()
+    if (design / "coupon.json").is_file():
+        raise click.UsageError(f"{design} is a kerf coupon: fabctl kerf cut {design}")
     bundle, spec = open_design(design)
     chosen = load_material(material or spec.material, home.root)
     config = load_bench(bench_name, home.root)
@@ -94,11 +106,11 @@ def run(
             order = replace(order, eye=eye_of(bench, marks, at_mm, chosen.thickness_mm, camera_file, image))
         desk = Desk(lambda question: confirm(question, yes), progress(), keys)
         if not dry_run:
-            say(HELP)
+            say_keys(HELP)
         if resume_run is not None:
             from fabctl.cut.resume import resume
 
-            done = resume(home, bench, order, home.runs / resume_run, desk, dry_run)
+            done = resume(home, bench, order, home.run(resume_run).path, desk, dry_run)
         else:
             done = cut(home, bench, order, desk, dry_run)
     facts: dict[str, Any] = {

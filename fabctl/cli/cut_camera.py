@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
+from fabctl.cli.paths import config_names
 
 if TYPE_CHECKING:
     from fabctl.bench import Bench
@@ -27,10 +28,11 @@ def eye_of(
 
     A registration of `fabctl camera register` is believed only while the bed still shows the sheet there.
     """
-    from drivers.camera import read_picture, snapshot
+    from drivers.camera import snapshot
     from fabctl.config.boards import load_board
     from fabctl.cut.by_camera import BedEye
     from fabctl.errors import UsageError
+    from fabctl.files import picture_of
     from fabctl.vision.register import read_registration
 
     if registration is not None and not _is_registration(registration):
@@ -41,7 +43,7 @@ def eye_of(
     board = load_board(expected.sheet if expected is not None else marks, lab().root).mark_sheet()
 
     def take() -> Any:
-        return read_picture(image) if image is not None else snapshot(bench.url("camera"))
+        return picture_of(image) if image is not None else snapshot(bench.url("camera"))
 
     height_mm = expected.height_mm if expected is not None else thickness_mm
     return BedEye(bench.state, board, height_mm, take, at_mm, expected, again=image is None)
@@ -58,8 +60,10 @@ def _is_registration(path: Path) -> bool:
 
 
 @click.command("marks")
-@click.argument("board")
-@click.option("--material", required=True, help="Material file or its name; its preset gives power and speed.")
+@click.argument("board", type=config_names("boards"))
+@click.option(
+    "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives power and speed."
+)
 @click.option("--origin", type=click.Choice(["home", "here"]), default="home", show_default=True)
 @click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
 @bench_option
@@ -107,5 +111,5 @@ def plain_job(order: CutOrder, bench_name: str, purpose: str, yes: bool, dry_run
     home = lab()
     with open_bench(home, load_bench(bench_name, home.root), purpose) as bench, keyboard() as keys:
         if not dry_run:
-            say(HELP)
+            say_keys(HELP)
         return cut(home, bench, order, Desk(lambda question: confirm(question, yes), progress(), keys), dry_run)

@@ -8,23 +8,24 @@ from typing import TYPE_CHECKING
 import click
 
 from fabctl.cli.common import bench_option, json_option, lab, show
+from fabctl.cli.paths import SPECIMEN, InFile, PhotoFile
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from drivers.camera import Frame
     from fabctl.records.folder import RunFolder
-
-PATH = click.Path(path_type=Path)
-FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.command("inspect")
-@click.argument("specimen")
+@click.argument("specimen", type=SPECIMEN)
 @click.option("--thickness-mm", type=float, default=None, help="The sheet's; its material's when not given.")
-@click.option("--registration", type=FILE, help="Where the sheet lies now, if it was moved since the cut.")
-@click.option("-o", "--output", type=PATH, default=Path("inspection.png"), show_default=True, help="Annotated picture.")
-@click.option("--image", type=FILE, help="A picture of the bed, instead of the bench's camera.")
+@click.option("--registration", type=InFile(), help="Where the sheet lies now, if it was moved since the cut.")
+@click.option(
+    "-o", "--output", type=PhotoFile(), default=Path("inspection.png"), show_default=True, help="Annotated picture."
+)
+@click.option("--image", type=InFile(), help="A picture of the bed, instead of the bench's camera.")
 @bench_option
 @json_option
 def inspect_command(
@@ -52,6 +53,7 @@ def inspect_command(
     height_mm = _thickness(run) if thickness_mm is None else thickness_mm
     paths = read_paths(place.design / "paths.json")
     frame = bed_picture(bench_name, image)
+    _refuse_older(frame, run)
     alignment, doubts = checked_alignment(bench_and_state(bench_name)[1], frame)
 
     def to_pixels(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -80,6 +82,22 @@ def inspect_command(
     bad = any(finding.level == "error" for finding in findings)
     lines = [f"{specimen}: {text}", f"{output}: what was seen", *map(str, findings)]
     show(data, as_json, lines, OUT_OF_TOLERANCE if bad else DONE, f"{specimen} is not cut as designed: {text}")
+
+
+def _refuse_older(frame: Frame, run: RunFolder) -> None:
+    """Raise `RefusedError` where the picture was taken before the cut had ended: it shows another state."""
+    from datetime import datetime, timedelta
+
+    from design.findings import Finding
+    from fabctl.errors import RefusedError
+
+    ended = (run.outcome() or {}).get("finished_utc")
+    grace = timedelta(seconds=1)  # file systems keep time coarsely
+    if ended is None or datetime.fromisoformat(frame.taken_utc) + grace >= datetime.fromisoformat(ended):
+        return
+    text = f"the picture is of {frame.taken_utc[:19]}, the cut ended {ended[:19]} (UTC)"
+    found = Finding("PICTURE-OLD", text, where=frame.source, hint="take a picture of the bed after the cut")
+    raise RefusedError("this picture does not show the cut", [found])
 
 
 def _last_cut(specimen: str) -> RunFolder:

@@ -9,16 +9,19 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import json_option, lab, progress, show
+from fabctl.cli.paths import InFolder, OutFolder
 
 if TYPE_CHECKING:
+    from design.deploy.newton import Equilibrium
     from design.deploy.predict import Deployed
-    from design.deploy.supports import Settled, Support
+    from design.deploy.supports import Settled
+    from design.spec import Rim
     from fabctl.deploying import Laid
     from fabctl.events import Emit
 
 
 @click.command()
-@click.argument("design", type=click.Path(path_type=Path))
+@click.argument("design", type=InFolder())
 @click.option("--gravity", is_flag=True, help="Let the sheet's own weight act (along −z).")
 @click.option(
     "--support",
@@ -30,18 +33,24 @@ if TYPE_CHECKING:
 @click.option("--friction", type=click.FloatRange(0), default=0.5, show_default=True, help="Coefficient for coulomb.")
 @click.option("--level-floor", is_flag=True, help="A level floor instead of a bed made to the rim.")
 @click.option("--shapes", type=click.IntRange(0), default=0, help="Look for other equilibria from this many starts.")
-@click.option("--compensate", is_flag=True, help="Build DESIGN-compensated: other expansions, nearer to the target.")
+@click.option("--parts", type=click.IntRange(1, 6), default=1, show_default=True, help="Triangles along a unit's side.")
+@click.option(
+    "--compensate",
+    is_flag=True,
+    help="Build DESIGN-compensated: other expansions, nearer to the target; with --gravity under its weight.",
+)
 @click.option("--cascade", "by_unit", is_flag=True, help="Open the sheet from flat, one unit after the other.")
 @click.option("--animation/--no-animation", default=True, help="Write the deployment as an animated picture.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder to write into [DESIGN-deployed].")
+@click.option("-o", "--output", type=OutFolder(), help="Folder to write into [DESIGN-deployed].")
 @json_option
 def command(
     design: Path,
     gravity: bool,
-    support: Support,
+    support: Rim,
     friction: float,
     level_floor: bool,
     shapes: int,
+    parts: int,
     compensate: bool,
     by_unit: bool,
     animation: bool,
@@ -51,11 +60,14 @@ def command(
     """Predict what the sheet of the design folder DESIGN pops up to."""
     from design.deploy.predict import deploy
     from design.deploy.supports import settle
-    from fabctl.deploying import read_laid
+    from fabctl.deploying import divided, read_laid
     from fabctl.events import Event
 
+    if by_unit and parts > 1:
+        raise click.UsageError("--cascade opens whole units: leave --parts out")
     emit = progress()
     laid = read_laid(design, lab().root)
+    laid = divided(laid, parts) if parts > 1 else laid
     emit(Event("stage", f"deploying {len(laid.layout.cells)} units"))
     popped = deploy(laid.layout, laid.target, laid.start_mm if laid.design_mm is None else laid.design_mm)
     settled = None
@@ -63,11 +75,11 @@ def command(
         emit(Event("stage", f"its weight acts; rim: {support}"))
         settled = settle(laid.layout, popped.mesh.vertices_mm, laid.sheet, support, friction, not level_floor)
     folder = output or design.with_name(design.name + "-deployed")
-    facts = {**_facts(popped), **_softest(laid, popped), **_sag(settled, support)}
+    facts = {**_facts(popped, parts), **_softest(laid, popped.equilibrium), **_sag(settled, support)}
     if shapes:
         facts["shapes"] = _shapes(laid, shapes, emit)
     if compensate:
-        facts["compensated"] = _compensated(design, emit)
+        facts["compensated"] = _compensated(design, emit, support if gravity else None)
     folder.mkdir(parents=True, exist_ok=True)
     if by_unit:
         facts["cascade"] = _cascade(laid, folder, popped, animation, emit)
@@ -76,10 +88,11 @@ def command(
     show(facts, as_json, _lines(facts))
 
 
-def _facts(popped: Deployed) -> dict[str, Any]:
+def _facts(popped: Deployed, parts: int) -> dict[str, Any]:
     rest, off = popped.equilibrium, popped.deviation
     return {
-        "units_count": len(popped.mesh.faces),
+        "units_count": len(popped.mesh.faces) // parts**2,
+        "triangles_count": len(popped.mesh.faces),
         "deviation_mean_mm": off.mean_mm,
         "deviation_rms_mm": off.rms_mm,
         "deviation_max_mm": off.max_mm,
@@ -92,12 +105,12 @@ def _facts(popped: Deployed) -> dict[str, Any]:
     }
 
 
-def _softest(laid: Laid, popped: Deployed) -> dict[str, Any]:
+def _softest(laid: Laid, rest: Equilibrium) -> dict[str, Any]:
     """Return how far the shape is from giving way: the smallest stiffness of any small motion, rigid ones held."""
     from design.deploy.newton import System, smallest_eigenvalue_N_mm
 
     system = System(laid.layout.shell())
-    return {"smallest_eigenvalue_N_mm": smallest_eigenvalue_N_mm(system, popped.equilibrium.x_mm, (), None)}
+    return {"smallest_eigenvalue_N_mm": smallest_eigenvalue_N_mm(system, rest.x_mm, (), None)}
 
 
 def _sag(settled: Settled | None, support: str) -> dict[str, Any]:
@@ -110,6 +123,8 @@ def _sag(settled: Settled | None, support: str) -> dict[str, Any]:
         "slid_mm": settled.slid_mm,
         "standing_count": settled.standing_count,
         "loaded_residual_ratio": settled.equilibrium.residual_ratio,
+        "loaded_iterations_count": settled.equilibrium.iterations_count,
+        "loaded_smallest_eigenvalue_N_mm": settled.smallest_eigenvalue_N_mm,
         "loaded_stable": settled.equilibrium.stable,
     }
 
@@ -129,7 +144,8 @@ def _shapes(laid: Laid, count: int, emit: Emit) -> list[dict[str, Any]]:
         rest = one.equilibrium
         rows.append(
             {"energy_mJ": rest.energy_mJ, "deviation_mean_mm": off.mean_mm, "deviation_mean_frac": off.mean_frac,
-             "stable": rest.stable, "residual_ratio": rest.residual_ratio, "starts": list(one.starts)}
+             "stable": rest.stable, "residual_ratio": rest.residual_ratio, "iterations_count": rest.iterations_count,
+             **_softest(laid, rest), "starts": list(one.starts)}
         )  # fmt: skip
     for line in lost:
         emit(Event("warning", f"no shape from {line}"))
@@ -154,7 +170,7 @@ def _cascade(laid: Laid, folder: Path, popped: Deployed, animation: bool, emit: 
     write_atomically(folder / "cascade.csv", cascade_csv(found))
     if animation:
         gif = animation_gif(followed(found.frames_mm, popped.mesh.vertices_mm), popped.mesh, "opened unit by unit")
-        (folder / "cascade.gif").write_bytes(gif)
+        write_atomically(folder / "cascade.gif", gif)
     end = replace(popped.equilibrium, x_mm=found.x_mm)
     off = compared(laid.layout, end, laid.target, laid.design_mm).deviation
     return {
@@ -167,18 +183,20 @@ def _cascade(laid: Laid, folder: Path, popped: Deployed, animation: bool, emit: 
         "energy_mJ": found.energy_mJ,
         "stable": found.stable,
         "residual_ratio": found.residual_ratio,
+        "iterations_count": found.iterations_count,
+        "smallest_eigenvalue_N_mm": found.smallest_eigenvalue_N_mm,
         "deviation_mean_mm": off.mean_mm,
     }
 
 
-def _compensated(design: Path, emit: Emit) -> dict[str, Any]:
-    """Build the same design with compensated expansions beside it; refuse where that does not help."""
+def _compensated(design: Path, emit: Emit, rim: Rim | None) -> dict[str, Any]:
+    """Build the same design with compensated expansions beside it, free or on `rim`; refuse where they do not help."""
     from design.bundle import open_bundle
     from fabctl.designing import build_compensated
 
     bundle = open_bundle(design)
     folder = design.with_name(design.name + "-compensated")
-    built, told = build_compensated(bundle, folder, lab().root, emit)
+    built, told = build_compensated(bundle, folder, lab().root, emit, rim or True)
     off = None if built.predicted is None else built.predicted.deployed.deviation
     return {
         "folder": str(folder),
@@ -201,10 +219,10 @@ def _write(
     shown = popped.mesh if settled is None else TriMesh(settled.equilibrium.x_mm, popped.mesh.faces)
     write_ply(folder / "deployed.ply", shown)
     title = "deployed" if settled is None else f"deployed, under its weight ({facts['support']})"
-    (folder / "deployed.png").write_bytes(picture_png(shown, laid.target, title))
+    write_atomically(folder / "deployed.png", picture_png(shown, laid.target, title))
     if animation:
         frames = deployment(laid.layout, popped.mesh.vertices_mm)
-        (folder / "deployment.gif").write_bytes(animation_gif(frames, popped.mesh, "deployment"))
+        write_atomically(folder / "deployment.gif", animation_gif(frames, popped.mesh, "deployment"))
     write_atomically(folder / "deploy.json", as_json(facts))
 
 
@@ -219,11 +237,13 @@ def _lines(facts: dict[str, Any]) -> list[str]:
     if "sag_mm" in facts:
         lines.append(
             f"weight {facts['weight_N']:.3f} N, rim {facts['support']}: sags {facts['sag_mm']:.2f} mm at the top, "
-            f"slides {facts['slid_mm']:.2f} mm"
+            f"slides {facts['slid_mm']:.2f} mm; {'stable' if facts['loaded_stable'] else 'not stable'} "
+            f"(smallest eigenvalue {facts['loaded_smallest_eigenvalue_N_mm']:.1e} N/mm)"
         )
     for shape in facts.get("shapes", []):
         lines.append(
-            f"shape of {shape['energy_mJ']:.4f} mJ: {shape['deviation_mean_mm']:.2f} mm from the target "
+            f"shape of {shape['energy_mJ']:.4f} mJ: {shape['deviation_mean_mm']:.2f} mm from the target, residual "
+            f"{shape['residual_ratio']:.1e}, smallest eigenvalue {shape['smallest_eigenvalue_N_mm']:.1e} N/mm "
             f"({', '.join(shape['starts'])})"
         )
     if "cascade" in facts:

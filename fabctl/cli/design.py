@@ -7,8 +7,9 @@ from typing import Any, cast
 
 import click
 
-from fabctl.cli.common import json_option, lab, progress, say, show
-from fabctl.cli.design_coupon import coupon, coupon_read
+from fabctl.cli.common import MATERIAL, json_option, lab, progress, say, show
+from fabctl.cli.design_coupon import coupon, coupon_read, library_option
+from fabctl.cli.paths import TARGET, InFile, InFolder, OutFolder, PictureFile, config_names
 from fabctl.events import Event
 
 
@@ -22,10 +23,11 @@ command.add_command(coupon_read)
 
 
 @command.command()
-@click.argument("spec")
-@click.option("--target", type=click.Path(path_type=Path), help="Mesh to use instead of the specification's.")
+@click.argument("spec", type=config_names("specs"))
+@click.option("--target", type=InFile(), help="Mesh to use instead of the specification's.")
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell, instead of the specification's.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Design folder to write [out/NAME].")
+@library_option
+@click.option("-o", "--output", type=OutFolder(), help="Design folder to write [out/NAME].")
 @click.option("--replace", is_flag=True, help="Replace a design that lies in that folder.")
 @click.option("--compensate", is_flag=True, help="Change the expansions so that the bent sheet meets the target.")
 @json_option
@@ -33,6 +35,7 @@ def build(
     spec: str,
     target: Path | None,
     cell_mm: float | None,
+    library: Path | None,
     output: Path | None,
     replace: bool,
     compensate: bool,
@@ -45,7 +48,7 @@ def build(
 
     home = lab().root
     folder = output or home / "out" / load_spec(spec, home)[0].name
-    design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress(), compensate)
+    design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress(), compensate, library)
     for finding in design.findings:
         say(str(finding))
     numbers = facts(design)
@@ -66,33 +69,48 @@ def build(
 
 
 @command.command()
-@click.argument("target")
-@click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
+@click.argument("target", type=TARGET)
+@click.option(
+    "--material", type=MATERIAL, help="Material file or its name, for a mesh or surface [natural-rubber-2.3]."
+)
 @click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell [the material's].")
-@click.option("--cells", type=click.Choice(["expanding", "contracting"]), default="expanding", show_default=True,
-              help="Kind of cells, where TARGET is no specification.")  # fmt: skip
+@library_option
+@click.option("--cells", type=click.Choice(["expanding", "contracting"]),
+              help="Kind of cells, for a mesh or surface [expanding].")  # fmt: skip
 @click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]), default="none", show_default=True,
               help="What to try where no single sheet fits.")  # fmt: skip
-@click.option("--picture", type=click.Path(path_type=Path), help="PNG of where the surface does not fit.")
+@click.option("--picture", type=PictureFile((".png",)), help="PNG of where the surface does not fit.")
 @json_option
 def check(
-    target: str, material: str, cell_mm: float | None, cells: str, remedy: str, picture: Path | None, as_json: bool
+    target: str,
+    material: str | None,
+    cell_mm: float | None,
+    library: Path | None,
+    cells: str | None,
+    remedy: str,
+    picture: Path | None,
+    as_json: bool,
 ) -> None:
-    """Say whether a sheet can become TARGET: a mesh file, a specification, or one of the project's own surfaces."""
+    """Say whether a sheet can become TARGET: a specification, a mesh file, or one of the project's own surfaces.
+
+    A name that is a specification and a surface, such as cap, is the specification, as for `fabctl design build`;
+    with --material or --cells it is the surface.
+    """
     from design.checking import check as checked
     from design.checking import misfit_png
     from fabctl.designing import inputs_for
     from fabctl.errors import DONE, REFUSED
+    from fabctl.records.folder import write_atomically
 
     listen = progress()
-    inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells))
+    inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
 
     def watch(message: str, done_frac: float) -> None:
         listen(Event("progress", message, done_frac))
 
     found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, remedy, watch)
     if picture is not None:
-        picture.write_bytes(misfit_png(inputs.mesh, found.report, inputs.spec.name))
+        write_atomically(picture, misfit_png(inputs.mesh, found.report, inputs.spec.name))
     findings = [*inputs.findings, *found.findings]
     for finding in findings:
         say(str(finding))
@@ -116,8 +134,8 @@ def check(
 
 
 @command.command()
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
+@click.argument("a", type=InFolder())
+@click.argument("b", type=InFolder())
 @json_option
 def compare(a: Path, b: Path, as_json: bool) -> None:
     """Compare two design folders: sheet, cells, cutting, deployed shape and stiffness."""

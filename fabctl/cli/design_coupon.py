@@ -8,21 +8,29 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import json_option, lab, show
+from fabctl.cli.common import MATERIAL, json_option, lab, show
 from fabctl.cli.finite import numbers
+from fabctl.cli.paths import SPECIMEN, SPECIMEN_OR_FILE, InFile, OutFolder
 
 if TYPE_CHECKING:
     from fabctl.coupon import Measured
+
+library_option = click.option("--library", type=InFile(), help="Library of cells (.npz), or a published map (.csv).")
 
 
 @click.command()
 @click.option("--expansion", "expansion_ratio", type=click.FloatRange(1, min_open=True), default=1.5,
               show_default=True, help="Of the cell to try.")  # fmt: skip
 @click.option("--hinges-mm", default="0.20,0.25,0.30,0.35,0.40,0.45", show_default=True, help="Ladder of hinge widths.")
-@click.option("--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="New folder for the coupon.")
+@click.option(
+    "--material", type=MATERIAL, default="natural-rubber-2.3", show_default=True, help="Material file or its name."
+)
+@library_option
+@click.option("-o", "--output", type=OutFolder(), required=True, help="New folder for the coupon.")
 @json_option
-def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, as_json: bool) -> None:
+def coupon(
+    expansion_ratio: float, hinges_mm: str, material: str, library: Path | None, output: Path, as_json: bool
+) -> None:
     """Make a sheet of uniform patches, one a hinge width, to check the library on the real material.
 
     The folder is cut as a design's is (`fabctl cut run`). Lengths are measured from a notch of a patch's left border
@@ -34,7 +42,8 @@ def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, 
     hinges = tuple(numbers(hinges_mm, "--hinges-mm"))
     if min(hinges) <= 0:
         raise click.UsageError("--hinges-mm takes widths above zero")
-    asked = CouponConfig(material=material, expansion_ratio=expansion_ratio, hinges_mm=hinges)
+    chosen_from = None if library is None else str(library.resolve())
+    asked = CouponConfig(material=material, expansion_ratio=expansion_ratio, hinges_mm=hinges, library=chosen_from)
     made, bundle = write_coupon(output, asked, lab().root)
     width, height = made.drawing.size_mm
     lines = [f"{output}: {len(made.patches)} patches on {width:.0f} × {height:.0f} mm"]
@@ -46,10 +55,12 @@ def coupon(expansion_ratio: float, hinges_mm: str, material: str, output: Path, 
 
 
 @click.command("coupon-read")
-@click.argument("form")
+@click.argument("form", type=SPECIMEN_OR_FILE)
 @click.option("--length-error-mm", type=click.FloatRange(min=0), default=0.2, show_default=True,
               help="Standard error of one reading of a length.")  # fmt: skip
-@click.option("--specimen", help="Specimen that the form belongs to, where it is not the specimen's own.")
+@click.option(
+    "--specimen", type=SPECIMEN, help="Specimen that the form belongs to, where it is not the specimen's own."
+)
 @json_option
 def coupon_read(form: str, length_error_mm: float, specimen: str | None, as_json: bool) -> None:
     """Read a coupon's filled FORM: measured expansions and open-close cycles against the map.

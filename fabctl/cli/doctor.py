@@ -5,11 +5,17 @@ from __future__ import annotations
 import click
 
 from fabctl.cli.common import json_option, lab, show
+from fabctl.cli.paths import config_names
 from fabctl.errors import DEVICE, DONE
 
 
 @click.command("doctor")
-@click.option("--bench", "bench_name", help="Also look at this bench's devices (asks each who it is; nothing moves).")
+@click.option(
+    "--bench",
+    "bench_name",
+    type=config_names("benches"),
+    help="Also look at this bench's devices (asks each who it is; nothing moves).",
+)
 @json_option
 def command(bench_name: str | None, as_json: bool) -> None:
     """Say what of this machine and bench works. Nothing moves and nothing is written."""

@@ -5,12 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import click
-
-PICTURES = (".svg", ".png", ".pdf")
 
 Callback = Callable[[click.Context, click.Parameter, Any], Any]
 
@@ -55,17 +52,3 @@ def numbers(text: str, option: str) -> list[float]:
     if not all(map(math.isfinite, found)):
         raise click.UsageError(f"{option} takes finite numbers with commas between them, not {text!r}")
     return found
-
-
-class PictureFile(click.Path):
-    """A picture to be written: `.svg`, `.png` or `.pdf`, asked for before anything is computed."""
-
-    def __init__(self) -> None:
-        super().__init__(path_type=Path, dir_okay=False)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path; fail where its ending names no kind of picture."""
-        path = Path(str(super().convert(value, param, ctx)))
-        if path.suffix.lower() not in PICTURES:
-            self.fail(f"{value}: a picture ends in {', '.join(PICTURES)}", param, ctx)
-        return path

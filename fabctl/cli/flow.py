@@ -6,19 +6,27 @@ from pathlib import Path
 
 import click
 
-from fabctl.bench import deployment_checklist, refuse_without
+from fabctl.bench import deployment_checklist, open_bench, refuse_without
 from fabctl.cli.common import bench_option, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.paths import SPECIMEN, InFile, config_names
 from fabctl.config.bench import find, load_bench
+from fabctl.config.method import load_method
 from fabctl.errors import DONE, OUT_OF_TOLERANCE
 from fabctl.flow import Flow, Order, continued, runner, steps_after_deployment, steps_until_cut
 
 
 @click.command("flow")
-@click.argument("spec", required=False)
-@click.option("--target", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Another target surface.")
-@click.option("--continue", "specimen", metavar="SPECIMEN", help="Go on with a sheet that was cut and is deployed.")
+@click.argument("spec", required=False, type=config_names("specs"))
+@click.option("--target", type=InFile(), help="Another target surface.")
 @click.option(
-    "--method", default="dome", show_default=True, help="How it is pressed: file, or name in configs/methods."
+    "--continue", "specimen", type=SPECIMEN, metavar="SPECIMEN", help="Go on with a sheet that was cut and is deployed."
+)
+@click.option(
+    "--method",
+    type=config_names("methods"),
+    default="dome",
+    show_default=True,
+    help="How it is pressed: file, or name in configs/methods.",
 )
 @click.option("--tolerance-frac", type=float, default=0.02, show_default=True, help="Of the target's diagonal.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Same seed, same scan and same answer.")
@@ -46,17 +54,24 @@ def command(
     home = lab()
     bench = load_bench(bench_name, home.root)
     refuse_without(bench, "laser", "rig", "scan")
+    if target is not None:
+        from design.meshfiles import read_mesh
+
+        read_mesh(target)  # a mesh that cannot be used is told now, not by the first step
+    load_method(method, home.root)  # a mistake in it is told now, not after the cut
     order = Order(bench, bench_name, method, tolerance_frac, yes, seed)
-    run, emit = runner(home), progress()
-    if specimen is not None:
-        flow = continued(home, specimen)
-    else:
-        assert spec is not None
-        flow = steps_until_cut(home, order, find("specs", spec, home.root), target, run, emit)
-        if bench.deployment == "by_hand":
-            _wait_for_a_person(flow, order, as_json)
-            return
-    flow = steps_after_deployment(order, flow, run, emit)
+    with open_bench(home, bench, f"flow {specimen or spec}") as held:
+        run, emit = runner(home, held), progress()
+        if specimen is not None:
+            flow = continued(home, specimen)
+        else:
+            assert spec is not None
+            flow = steps_until_cut(home, order, find("specs", spec, home.root), target, run, emit)
+        by_hand = specimen is None and bench.deployment == "by_hand"
+        flow = flow if by_hand else steps_after_deployment(order, flow, run, emit)
+    if by_hand:
+        _wait_for_a_person(flow, order, as_json)
+        return
     report = flow.steps["report"]
     data = {"specimen": flow.specimen, "design": flow.design, **flow.steps}
     data |= {"verdict": report["verdict"], "sentence": report["sentence"], "report": report["report"]}

@@ -9,10 +9,22 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.paths import RUN, RUN_OR_SPECIMEN, SPECIMEN, OutFile, PictureFile, config_names
 
 if TYPE_CHECKING:
     from fabctl.indent.job import IndentPlan
     from fabctl.records.folder import RunFolder
+
+NAMED = (
+    ("stiffness at contact", "stiffness_initial_N_mm", "N/mm"),
+    ("secant stiffness", "stiffness_secant_N_mm", "N/mm"),
+    ("largest force", "force_max_N", "N"),
+    ("energy in", "load_energy_mJ", "mJ"),
+    ("hysteresis", "hysteresis_ratio", ""),
+    ("barrier", "barrier_mJ", "mJ"),
+    ("recovery", "recovery_ratio", ""),
+)
+WORDS = {name: words for words, name, _ in NAMED}
 
 
 @click.group()
@@ -21,12 +33,23 @@ def command() -> None:
 
 
 @command.command("run")
-@click.argument("specimen")
-@click.option("--method", default="dome", show_default=True, help="Method file or its name in configs/methods.")
+@click.argument("specimen", type=SPECIMEN)
+@click.option(
+    "--method",
+    type=config_names("methods"),
+    default="dome",
+    show_default=True,
+    help="Method file or its name in configs/methods.",
+)
 @bench_option
-@click.option("--resume", metavar="RUN", help="Go on with an interrupted run, at its next whole curve or point.")
+@click.option(
+    "--resume", type=RUN, metavar="RUN", help="Go on with an interrupted run, at its next whole curve or point."
+)
 @click.option("--temperature-degC", type=float, help="Room temperature, where the rig has no sensor of its own.")
-@click.option("--humidity-frac", type=float, help="Relative humidity, 0 to 1.")
+@click.option("--humidity-frac", type=click.FloatRange(0, 1), help="Relative humidity, 0 to 1.")
+@click.option("--thickness-mm", type=click.FloatRange(min=0, min_open=True), help="As measured on this specimen.")
+@click.option("--batch", help="Of the material.")
+@click.option("--rest-h", type=click.FloatRange(min=0), help="Hours since it was deployed, or last pressed.")
 @click.option("--dry-run", is_flag=True, help="Stop after the check; nothing moves.")
 @yes_option
 @json_option
@@ -37,6 +60,9 @@ def run_command(
     resume: str | None,
     temperature_degc: float | None,
     humidity_frac: float | None,
+    thickness_mm: float | None,
+    batch: str | None,
+    rest_h: float | None,
     dry_run: bool,
     yes: bool,
     as_json: bool,
@@ -47,12 +73,18 @@ def run_command(
     from fabctl.config.bench import load_bench
     from fabctl.errors import Stopped
     from fabctl.indent.job import Steering, plan_test, refuse, run_test
-    from fabctl.records.folder import open_run
 
     place = lab()
     bench_config = load_bench(bench_name, place.root)
-    earlier = open_run(place.runs / resume) if resume else None
-    plan = plan_test(place, place.specimen(specimen), method, bench_config, earlier)
+    earlier = place.run(resume) if resume else None
+    facts = {
+        "temperature_degC": temperature_degc,
+        "humidity_frac": humidity_frac,
+        "thickness_mm": thickness_mm,
+        "batch": batch,
+        "rest_h": rest_h,
+    }
+    plan = plan_test(place, place.specimen(specimen), method, bench_config, earlier, facts)
     for line in _screen(plan, bench_config.name):
         say(line)
     refuse(plan)
@@ -61,23 +93,15 @@ def run_command(
         return
     if not confirm("Start?", yes):
         raise Stopped("not started")
-    facts = {"temperature_degC": temperature_degc, "humidity_frac": humidity_frac}
     with open_bench(place, bench_config, f"testing {specimen}") as bench, Keys(progress()) as keys:
-        run = run_test(
-            place,
-            plan,
-            bench,
-            keys.listen,
-            Steering(keys.wish, keys.go_on),
-            {name: value for name, value in facts.items() if value is not None},
-        )
+        run = run_test(place, plan, bench, keys.listen, Steering(keys.wish, keys.go_on))
     _render(run, as_json)
 
 
 @command.command("analyse")
-@click.argument("runs", nargs=-1)
+@click.argument("runs", nargs=-1, type=RUN_OR_SPECIMEN)
 @click.option("--group", "groups", multiple=True, metavar="NAME=RUN,RUN,…", help="Compare groups of runs.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Picture of all curves (SVG or PNG).")
+@click.option("-o", "--output", type=PictureFile(), help="Picture of all curves (SVG, PNG or PDF).")
 @json_option
 def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path | None, as_json: bool) -> None:
     """Analyse RUNS anew from their samples: run ids, folders, or specimens (all their runs)."""
@@ -91,7 +115,8 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
     lines = []
     for name, found in body["groups"].items():
         lines.append(f"{name}: {len(found['runs'])} runs")
-        lines += list(_lines(found["runs"][0]["result"])) if len(found["runs"]) == 1 else []
+        one = len(found["runs"]) == 1
+        lines += list(_lines(found["runs"][0]["result"])) if one else [_short(each) for each in found["runs"]]
         if found.get("stiffness_secant_N_mm") is not None:
             spread = found["stiffness_secant_N_mm"]
             lines.append(f"  secant stiffness {spread['mean']:.4g} ± {spread['sd']:.2g} N/mm (n = {spread['count']})")
@@ -101,12 +126,15 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
             if ratio["low_ratio"] is not None
             else f"no interval: {ratio['reason']}"
         )
-        lines.append(f"{ratio['above']} / {ratio['below']}: {ratio['value_ratio']:.3f}, 95 % {ends} ({ratio['how']})")
+        what = WORDS.get(ratio["figure"], ratio["figure"])
+        lines.append(
+            f"{ratio['above']} / {ratio['below']}, {what}: {ratio['value_ratio']:.3f}, 95 % {ends} ({ratio['how']})"
+        )
     show(body, as_json, lines)
 
 
 @command.command("export")
-@click.argument("run")
+@click.argument("run", type=RUN)
 @click.option(
     "--format",
     "kind",
@@ -114,14 +142,13 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
     default="csv",
     show_default=True,
 )
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True)
+@click.option("-o", "--output", type=OutFile(), required=True)
 @json_option
 def export_command(run: str, kind: str, output: Path, as_json: bool) -> None:
     """Write the samples of RUN for other programs: CSV with units, Parquet, HDF5, or bluesky documents."""
     from fabctl.indent.export import export
-    from fabctl.indent.groups import find_run
 
-    found = export(find_run(lab(), run), kind, output)
+    found = export(lab().run(run), kind, output)
     show(found, as_json, [f"{output}: {found['rows_count']} rows"])
 
 
@@ -159,17 +186,19 @@ def _render(run: RunFolder, as_json: bool) -> None:
     show(body, as_json, [f"run {run.run_id}", *_lines(result), f"  {run.path / 'artefacts' / 'curve.svg'}"])
 
 
+def _short(entry: dict[str, Any]) -> str:
+    """Return one run among several in one line."""
+    result = entry["result"]
+    secant, most = result.get("stiffness_secant_N_mm"), result.get("force_max_N")
+    if secant is None:
+        why = result.get("not_found", {}).get("stiffness_secant_N_mm", "no curve")
+        return f"  {entry['run']} ({entry['status']}): secant stiffness not found: {why}"
+    half = result.get("stiffness_secant_ci95_N_mm") or 0.0
+    return f"  {entry['run']} ({entry['status']}): secant {secant:.4g} ± {half:.2g} N/mm, largest force {most:.4g} N"
+
+
 def _lines(result: dict[str, Any]) -> Iterator[str]:
-    named = (
-        ("stiffness at contact", "stiffness_initial_N_mm", "N/mm"),
-        ("secant stiffness", "stiffness_secant_N_mm", "N/mm"),
-        ("largest force", "force_max_N", "N"),
-        ("energy in", "load_energy_mJ", "mJ"),
-        ("hysteresis", "hysteresis_ratio", ""),
-        ("barrier", "barrier_mJ", "mJ"),
-        ("recovery", "recovery_ratio", ""),
-    )
-    for words, name, unit in named:
+    for words, name, unit in NAMED:
         value = result.get(name)
         if value is None:
             yield f"  {words:22} not found: {result.get('not_found', {}).get(name, 'no curve')}"

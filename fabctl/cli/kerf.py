@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import bench_option, json_option, lab, show
+from fabctl.cli.common import MATERIAL, bench_option, json_option, lab, show, yes_option
 from fabctl.cli.finite import numbers
+from fabctl.cli.paths import InFile, InFolder, OutFolder
 
 if TYPE_CHECKING:
+    from fabctl.vision.coupon import Coupon
     from fabctl.vision.kerf import KerfMeasurement
-
-PATH = click.Path(path_type=Path)
-FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.group("kerf")
@@ -24,13 +22,17 @@ def command() -> None:
 
 
 @command.command("coupon")
-@click.option("--material", required=True, help="Material file or its name; its preset gives speed and passes.")
+@click.option(
+    "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives speed and passes."
+)
 @click.option("--powers", default=None, metavar="0.4,0.5,…", help="Power steps; around the preset's when not given.")
-@click.option("-o", "--output", type=PATH, default=Path("coupon"), show_default=True, help="Folder to write into.")
+@click.option(
+    "-o", "--output", type=OutFolder(), default=Path("coupon"), show_default=True, help="Folder to write into."
+)
 @bench_option
 @json_option
 def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_json: bool) -> None:
-    """Make a coupon: slits along x and y and open squares at several powers, with marks around."""
+    """Make a coupon for `kerf cut`: slits along x and y and open squares at several powers, with marks around."""
     from design.export.dxf import dxf
     from design.export.gcode import GcodeOptions
     from design.pattern.paths import LayerPreset
@@ -65,37 +67,86 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
     w, h = made.size_mm
     data = {"folder": str(output), "powers_frac": steps, "size_mm": [w, h], "lines_count": len(lines)}
     text = f"{output}: {w:g} x {h:g} mm, powers {', '.join(f'{p:g}' for p in steps)}"
-    advice = "cut coupon.nc, let the squares fall out, photograph it over a light table at 0.05 mm a pixel or finer"
-    show(data, as_json, [text, advice, f"fabctl kerf measure PICTURE --coupon {output / 'coupon.json'}"])
+    show(data, as_json, [text, f"fabctl kerf cut {output}"])
+
+
+@command.command("cut")
+@click.argument("folder", type=InFolder())
+@click.option("--origin", type=click.Choice(["home", "here"]), default="home", show_default=True)
+@click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
+@bench_option
+@yes_option
+@json_option
+def cut_coupon(folder: Path, origin: str, dry_run: bool, bench_name: str, yes: bool, as_json: bool) -> None:
+    """Cut the coupon in FOLDER: the same checks, the same question and the same record as any cut."""
+    from design.export.gcode import GcodeOptions
+    from design.pattern.paths import LayerPreset
+    from fabctl.cli.cut_camera import plain_job
+    from fabctl.config.bench import load_bench
+    from fabctl.config.material import load_material
+    from fabctl.cut.job import CutOrder, laser_config_of
+    from fabctl.vision.coupon import coupon_gcode
+
+    file = folder / "coupon.json"
+    made, material = read_coupon(file)
+    stuff = load_material(material, lab().root)
+    spot_mm = laser_config_of(load_bench(bench_name, lab().root)).spot_mm
+    layer = stuff.laser.engrave if stuff.laser is not None else None
+    engrave = LayerPreset(layer.power_frac, layer.feed_mm_s, layer.passes_count) if layer else LayerPreset(0.0, 1.0)
+
+    def compose(_: str, s_max_count: float) -> tuple[str, ...]:
+        return coupon_gcode(made, engrave, spot_mm, GcodeOptions(s_max_count=s_max_count))
+
+    order = CutOrder(file, compose, stuff, origin=origin, kind="coupon")  # type: ignore[arg-type]  # click.Choice has checked it
+    done = plain_job(order, bench_name, f"coupon {folder.name}", yes, dry_run)
+    facts = {"coupon": str(file), "run": done.run.run_id if done.run else None, **done.result}
+    if done.run is None:
+        show(facts, as_json, [f"checked: {facts['lines_count']} lines"])
+        return
+    done.run.artefact("coupon.json").write_bytes(file.read_bytes())
+    advice = "let the squares fall out, photograph it over a light table at 0.05 mm a pixel or finer, then:"
+    command_line = f"fabctl kerf measure PICTURE --coupon {file} --write"
+    show(facts, as_json, [f"the coupon is cut; run {done.run.run_id}", advice, command_line])
+
+
+def read_coupon(path: Path) -> tuple[Coupon, str]:
+    """Return the coupon in a `coupon.json`, and the material it is for; raise `UsageError` where it is none."""
+    from fabctl.errors import UsageError
+    from fabctl.files import json_of, why_not
+    from fabctl.vision.coupon import coupon_from
+
+    facts = json_of(path, "the coupon.json of `fabctl kerf coupon`")
+    try:
+        return coupon_from(facts, str(path)), str(facts["material"])
+    except (KeyError, TypeError, ValueError) as fault:
+        raise UsageError(f"{path}: not a coupon: {why_not(fault)}; `fabctl kerf coupon` makes one") from fault
 
 
 @command.command("measure")
-@click.argument("image", type=FILE)
-@click.option("--coupon", "coupon_file", type=FILE, required=True, help="The coupon.json of the coupon in the picture.")
+@click.argument("image", type=InFile())
+@click.option(
+    "--coupon", "coupon_file", type=InFile(), required=True, help="The coupon.json of the coupon in the picture."
+)
 @click.option("--write", is_flag=True, help="Write the kerf into the lab's material file.")
 @click.option("--gamma", type=click.Choice(["srgb", "linear"]), default="srgb", show_default=True)
 @json_option
 def measure(image: Path, coupon_file: Path, write: bool, gamma: str, as_json: bool) -> None:
     """Measure the kerf per power and direction in a picture of the coupon, with its uncertainty."""
-    from drivers.camera import read_picture
     from fabctl.config.material import load_material
     from fabctl.errors import UsageError
+    from fabctl.files import picture_of
     from fabctl.vision import kerf as kerfs
-    from fabctl.vision.coupon import coupon_from
 
-    try:
-        facts = json.loads(coupon_file.read_text(encoding="utf-8"))
-    except ValueError as fault:
-        raise UsageError(f"{coupon_file}: not JSON: {fault}") from fault
-    frame = read_picture(image)
-    found = kerfs.measure(frame.image, frame.source, coupon_from(facts, str(coupon_file)), gamma)
+    made, material = read_coupon(coupon_file)
+    frame = picture_of(image)
+    found = kerfs.measure(frame.image, frame.source, made, gamma)
     data, lines = _table(found)
     if write:
-        stuff = load_material(facts["material"], lab().root)
+        stuff = load_material(material, lab().root)
         if stuff.laser is None:
             raise UsageError(f"{stuff.name} has no laser preset")
         kerf_mm, doubt_mm = kerfs.kerf_at(found, stuff.laser.slit.power_frac)
-        path = _write_kerf(stuff.name, facts["material"], kerf_mm)
+        path = _write_kerf(stuff.name, material, kerf_mm)
         data |= {"material": stuff.name, "file": str(path), "kerf_mm": kerf_mm, "uncertainty_mm": doubt_mm}
         lines.append(f"{path}: kerf {stuff.laser.kerf_mm:g} mm, now {kerf_mm:.4f} ± {doubt_mm:.4f} mm")
     show(data, as_json, lines)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
 from fabctl.cli.finite import numbers
+from fabctl.cli.paths import OutFile
 
 if TYPE_CHECKING:
     from drivers.grbl.laser import Laser
@@ -208,16 +210,14 @@ def _go_around(laser: Laser, bench: Bench, corners: tuple[str, ...], power_frac:
 @click.option("--feeds", default="10,15,20,25,30", show_default=True, help="Speeds, mm/s.")
 @click.option("--passes", default="1", show_default=True, help="Numbers of passes.")
 @click.option("--cell-mm", type=click.FloatRange(min=2), default=8.0, show_default=True)
-@click.option("-o", "--out", type=click.Path(dir_okay=False), help="Only write the program to this file.")
+@click.option("-o", "--out", type=OutFile(), help="Only write the program to this file.")
 @bench_option
 @yes_option
 @json_option
 def testgrid(
-    powers: str, feeds: str, passes: str, cell_mm: float, out: str | None, bench_name: str, yes: bool, as_json: bool
+    powers: str, feeds: str, passes: str, cell_mm: float, out: Path | None, bench_name: str, yes: bool, as_json: bool
 ) -> None:
     """Cut a labelled grid of power, speed and passes from where the head is."""
-    from pathlib import Path
-
     from fabctl.cut.testgrid import Grid, grid_lines, size_mm
 
     grid = Grid(
@@ -231,8 +231,10 @@ def testgrid(
     width, height = size_mm(grid)
     facts = {"width_mm": width, "height_mm": height, "cells_count": len(grid.powers_frac) * len(grid.feeds_mm_s)}
     if out:
-        Path(out).write_text("\n".join(grid_lines(grid, 1000.0)) + "\n", encoding="ascii")
-        show({**facts, "file": out}, as_json, [f"{out}: {width:g} × {height:g} mm, for $30=1000"])
+        from fabctl.records.folder import write_atomically
+
+        write_atomically(out, "\n".join(grid_lines(grid, 1000.0)) + "\n")
+        show({**facts, "file": str(out)}, as_json, [f"{out}: {width:g} × {height:g} mm, for $30=1000"])
         return
     from fabctl.cut.by_hand import run_here
     from fabctl.cut.job import identity_of

@@ -1,9 +1,8 @@
-"""`fabctl library`: build, look into, compare and calibrate the library of bistable cells."""
+"""`fabctl library`: look into, compare and calibrate the library of bistable cells; `library_build` makes one."""
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -11,32 +10,28 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from fabctl.cli.common import json_option, lab, progress, say, show
-from fabctl.cli.finite import PictureFile
+from fabctl.cli.common import json_option, progress, show
+from fabctl.cli.library_build import build
+from fabctl.cli.library_parts import (
+    file_option,
+    jobs_option,
+    lines_of,
+    material_option,
+    processes_of,
+    sheet_named,
+    summary,
+    t_option,
+    theta_option,
+)
+from fabctl.cli.paths import InFile, PictureFile
 
 if TYPE_CHECKING:
+    from design.cells.calibrate import Loading
     from design.cells.compare import Comparison, Unanswered
     from design.cells.homogenise import Cell, Failure
-    from design.cells.library import CellLibrary
     from design.cells.sheet import Sheet
-    from design.cells.sweep import Progress
 
-material_option = click.option(
-    "--material", default="natural-rubber-2.3", show_default=True, help="Material file or its name."
-)
-file_option = click.option(
-    "--library", "file", type=click.Path(path_type=Path), help="A library file [the shipped one of the paper's sheet]."
-)
-t_option = click.option("--t-mm", type=float, required=True, help="Where slit 1 starts on its edge.")
-theta_option = click.option("--theta-deg", type=float, required=True, help="Direction of slit 1.")
 TOLD_ROWS_COUNT = 10  # of the rows without numbers, for a person
-jobs_option = click.option("--jobs", type=int, default=-1, show_default=True, help="Processes; -1 is one per core.")
-
-
-def _sheet(material: str) -> Sheet:
-    from fabctl.config.material import load_material, sheet_of
-
-    return sheet_of(load_material(material, lab().root))
 
 
 @click.group()
@@ -44,106 +39,7 @@ def command() -> None:
     """Build, look into and compare the library of bistable cells."""
 
 
-@command.command()
-@material_option
-@click.option(
-    "--theta", "theta_count", type=click.IntRange(5), default=43, show_default=True, help="Angles, -30° to 30°."
-)
-@click.option("--t-step-mm", type=float, default=0.01, show_default=True, help="Step of t.")
-@click.option(
-    "--open", "is_open", is_flag=True, help="The contracting kind: cut as holes, closing to its second state."
-)
-@jobs_option
-@click.option("--cluster", metavar="URL", help="A dask scheduler, tcp://HOST:PORT, whose workers have fabctl.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("library.npz"), show_default=True)
-@json_option
-def build(
-    material: str,
-    theta_count: int,
-    t_step_mm: float,
-    is_open: bool,
-    jobs: int,
-    cluster: str | None,
-    output: Path,
-    as_json: bool,
-) -> None:
-    """Simulate every cell of a sheet; goes on where an earlier build stopped."""
-    processes = _processes(jobs)
-    from design.cells.library import load_library, save_library
-    from design.cells.sweep import plan_of, sweep
-
-    sheet = _sheet(material)
-    plan = plan_of(sheet, theta_count, t_step_mm, kind="open" if is_open else "slit")
-    parts = lab().root / "library-cache"
-    report = _progress()
-    try:
-        cells = sweep(plan, parts, jobs=processes, cluster=cluster, report=report)
-    except KeyboardInterrupt:
-        say(f"stopped; finished columns are kept in {parts / plan.key()[:16]}, the same command goes on from there")
-        raise
-    words = f"fabctl library build --material {material} --theta {theta_count} --t-step-mm {t_step_mm:g}"
-    save_library(output, plan, sheet, cells, words + (" --open" if is_open else ""))
-    library = load_library(output)
-    show({"file": str(output), **_summary(library)}, as_json, [f"{output}", *_lines(library)])
-
-
-def _processes(jobs: int) -> int:
-    """Return how many processes work, each with one thread.
-
-    The matrices of a cell are too small to share: on a busy machine two threads of BLAS cost a column 5.5 s of
-    processor time, one costs 3.2 s. Called before NumPy is loaded, which reads these once; workers inherit them.
-    """
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-    return len(os.sched_getaffinity(0)) if jobs == -1 else max(jobs, 1)
-
-
-def _progress() -> Any:
-    from fabctl.events import Event
-
-    listen = progress()
-
-    def report(now: Progress) -> None:
-        left = "" if now.left_s is None else f", {now.left_s:.0f} s left"
-        text = f"{now.done_count} of {now.total_count} cells, {now.elapsed_s:.0f} s{left}"
-        listen(Event("progress", text, now.done_count / now.total_count))
-
-    return report
-
-
-def _summary(library: CellLibrary) -> dict[str, Any]:
-    low, high = library.range_ratio()
-    return {
-        "cells_count": len(library),
-        "range_ratio": [low, high],
-        "spread_ratio": high / low,
-        "candidates": library.counts(),
-        "reasons": library.reasons(),
-        "shallow_count": library.shallow_count(),
-        "sheet": asdict(library.sheet),
-        "hash": library.hash,
-        "command": library.meta["command"],
-    }
-
-
-def _lines(library: CellLibrary) -> Iterator[str]:
-    from design.cells.homogenise import LEAST_WELL_RATIO
-
-    low, high = library.range_ratio()
-    sheet = library.sheet
-    yield f"{len(library)} bistable cells, expansion {low:.4f} to {high:.4f} (spread {high / low:.3f})"
-    if shallow := library.shallow_count():
-        yield (
-            f"{shallow} more have a second state behind less than {LEAST_WELL_RATIO:.1%} of their energy: "
-            "not told from none on this mesh, and not in the range"
-        )
-    yield "candidates: " + ", ".join(f"{count} {verdict}" for verdict, count in library.counts().items())
-    yield from (f"  {count:5d} {reason}" for reason, count in library.reasons().items())
-    yield (
-        f"sheet: edge {sheet.edge_mm:g} mm, slit {sheet.slit_mm:g} mm, hinge {sheet.hinge_mm:g} mm, thickness "
-        f"{sheet.thickness_mm:g} mm, E {sheet.E_MPa:g} MPa, ν {sheet.nu_ratio:g}"
-    )
-    yield f"hash {library.hash[:16]}, made by: {library.meta['command']}"
+command.add_command(build)
 
 
 @command.command("show")
@@ -154,7 +50,7 @@ def show_command(file: Path | None, as_json: bool) -> None:
     from design.cells.library import load_library
 
     library = load_library(file)
-    show(_summary(library), as_json, _lines(library))
+    show(summary(library), as_json, lines_of(library))
 
 
 @command.command()
@@ -165,7 +61,7 @@ def show_command(file: Path | None, as_json: bool) -> None:
 @json_option
 def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output: Path, as_json: bool) -> None:
     """Draw the four maps, or energy and force of one cell along its uniaxial stretch."""
-    from design.cells.homogenise import Failure, solve_pair
+    from design.cells.homogenise import Failure, Trail, walked
     from design.cells.library import energy_scale_mJ, load_library
     from design.cells.mesh import REFERENCE
     from design.cells.periodic import periodic_cell, positions, uniaxial_curve
@@ -177,7 +73,7 @@ def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output:
     if t_mm is None or theta_deg is None:
         pictures.save(pictures.maps(library), output)
     else:
-        found = solve_pair(t_mm, math.radians(theta_deg), library.sheet, REFERENCE)
+        found, _, _ = walked(t_mm, math.radians(theta_deg), library.sheet, REFERENCE, Trail())
         if isinstance(found, Failure):
             _refuse(t_mm, theta_deg, found)
         m, pair = found
@@ -205,23 +101,37 @@ def _refuse(t_mm: float, theta_deg: float, why: Failure) -> NoReturn:
 @click.option("-o", "--output", type=PictureFile(), help="Draw the states of the cell into this file.")
 @json_option
 def cell_command(t_mm: float, theta_deg: float, material: str, output: Path | None, as_json: bool) -> None:
-    """Solve one cell: its numbers and slits, and with -o a picture of its states."""
+    """Solve one cell: its numbers and slits, and with -o a picture of its states. Exit code 3 if it is not bistable."""
     from design.cells.geometry import cell_slits
     from design.cells.homogenise import Failure, solve_cell
     from design.cells.states import cell_states
+    from fabctl.errors import REFUSED
     from fabctl.reports import cells as pictures
 
-    sheet, theta = _sheet(material), math.radians(theta_deg)
+    sheet, theta = sheet_named(material), math.radians(theta_deg)
     cell = solve_cell(t_mm, theta, sheet)
     numbers = _numbers(cell, sheet)
-    numbers["slits_mm"] = cell_slits(t_mm, theta, sheet).tolist()
+    numbers["slits_mm"] = None if cell.verdict == "invalid" else cell_slits(t_mm, theta, sheet).tolist()
+    show(numbers, as_json, _cell_lines(numbers))
+    if cell.verdict != "bistable":
+        raise SystemExit(REFUSED)
     if output is not None:
         found = cell_states(t_mm, theta, sheet)
         if isinstance(found, Failure):
             _refuse(t_mm, theta_deg, found)
-        else:
-            pictures.save(pictures.states(found), output)
-    show(numbers, as_json, [f"{key}: {value}" for key, value in numbers.items() if value is not None])
+        pictures.save(pictures.states(found), output)
+
+
+def _cell_lines(numbers: dict[str, Any]) -> Iterator[str]:
+    """Yield the numbers with the digits they have: the mesh alone moves an expansion by 0.002."""
+    for key, value in numbers.items():
+        if key == "slits_mm" and value is not None:
+            for k, slit in enumerate(value, 1):
+                yield f"slit {k}, mm: " + ", ".join(f"({x:.4f}, {y:.4f})" for x, y in slit)
+        elif isinstance(value, float):
+            yield f"{key}: {value:.1e}" if key == "residual_ratio" else f"{key}: {value:.5g}"
+        elif value is not None:
+            yield f"{key}: {value}"
 
 
 def _numbers(cell: Cell, sheet: Sheet) -> dict[str, Any]:
@@ -246,29 +156,31 @@ def _numbers(cell: Cell, sheet: Sheet) -> dict[str, Any]:
         "stiffness_mJ": stiffness,
         "Y_N_mm": None if stiffness is None else stiffness / hexagon_mm2(sheet),
         "nu_tangent_ratio": cell.nu_tangent_ratio,
+        "mesh_ratio": cell.mesh_ratio,
     }
 
 
 @command.command()
-@click.argument("published", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("published", type=InFile())
 @material_option
 @file_option
 @jobs_option
 @json_option
 def compare(published: Path, material: str, file: Path | None, jobs: int, as_json: bool) -> None:
     """Compare with a PUBLISHED table: each row solved afresh, then the library interpolated."""
-    processes = _processes(jobs)
+    processes = processes_of(jobs)
     import numpy as np
 
     from design.cells import compare as comparing
     from design.cells.library import load_library
     from fabctl.errors import UsageError
     from fabctl.events import Event
+    from fabctl.files import text_of
 
-    sheet = _sheet(material)
+    sheet, library = sheet_named(material), load_library(file)
     try:
-        table = comparing.read_published(published.read_text(encoding="utf-8"), sheet)
-    except (comparing.TableError, UnicodeDecodeError) as fault:
+        table = comparing.read_published(text_of(published, "a table of cells"), sheet)
+    except comparing.TableError as fault:
         raise UsageError(f"{published}: {fault}") from fault
     listen, total = progress(), len(table.t_mm)
     cells = comparing.solve_rows(
@@ -280,7 +192,7 @@ def compare(published: Path, material: str, file: Path | None, jobs: int, as_jso
     lines = [f"{total} rows, {int(subset.sum())} comparable"]
     ways = {
         "solved": comparing.columns_of(cells),
-        "interpolated": comparing.interpolated(table, load_library(file).scaled(sheet)),
+        "interpolated": comparing.interpolated(table, library.scaled(sheet)),
     }
     for way, numbers in ways.items():
         fair = comparing.compared(table, numbers, subset if subset.any() else everything)
@@ -340,20 +252,25 @@ def _finite(value: Any) -> Any:
 
 
 @command.command()
-@click.argument("measured", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.argument("response", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("measured", type=InFile())
+@click.argument("response", type=InFile())
+@click.option("--point", type=int, help="Which of MEASURED's points, where it has several.")
+@click.option("--curve", type=int, help="Which curve of that point [the last].")
 @material_option
 @json_option
-def calibrate(measured: Path, response: Path, material: str, as_json: bool) -> None:
-    """Find E·thickness: MEASURED (depth_mm, load_N) against the RESPONSE.csv predicted for the same specimen."""
+def calibrate(
+    measured: Path, response: Path, point: int | None, curve: int | None, material: str, as_json: bool
+) -> None:
+    """Find E·thickness: MEASURED (a run's curves.csv) against the RESPONSE.csv predicted for the same specimen."""
     from design.cells.calibrate import calibrate as fit
 
-    sheet = _sheet(material)
-    depth, force = _curve(measured)
-    found = fit(depth, force, *_curve(response))
+    sheet = sheet_named(material)
+    loading, model = _loading(measured, point, curve), _loading(response)
+    found = fit(loading.depth_mm, loading.force_N, model.depth_mm, model.force_N)
     stretch = sheet.E_MPa * sheet.thickness_mm
     result = {
         **asdict(found),
+        "curve": loading.name,
         "E_thickness_N_mm": found.factor_ratio * stretch,
         "E_thickness_ci95_N_mm": found.factor_ci95_ratio * stretch,
         "E_MPa": found.factor_ratio * sheet.E_MPa,
@@ -363,26 +280,19 @@ def calibrate(measured: Path, response: Path, material: str, as_json: bool) -> N
         f"(the material file says {stretch:.4g})",
         f"at {sheet.thickness_mm:g} mm: E_MPa: {result['E_MPa']:.4g}",
         f"contact at {found.contact_mm:.3f} mm, misfit {found.misfit_ratio:.1%} of the greatest force, "
-        f"{found.samples_count} samples",
+        f"{found.samples_count} samples" + (f" of {loading.name}" if loading.name else ""),
     ]
     show(result, as_json, lines)
 
 
-def _curve(path: Path) -> tuple[Any, Any]:
-    """Return depth_mm and load_N (or force_N) of a CSV with a header; lines that begin with # are passed over."""
-    import csv
-
-    import numpy as np
-
+def _loading(path: Path, point: int | None = None, curve: int | None = None) -> Loading:
+    from design.cells.calibrate import read_loading
+    from design.errors import DesignError
     from fabctl.errors import UsageError
+    from fabctl.files import text_of
 
-    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
-    rows = list(csv.DictReader(lines))
-    force = next((name for name in ("load_N", "force_N") if rows and name in rows[0]), None)
-    if force is None or "depth_mm" not in rows[0]:
-        raise UsageError(f"{path}: needs the columns depth_mm and load_N (or force_N)")
+    text = text_of(path, "a CSV with the columns depth_mm and load_N")
     try:
-        pairs = np.array([[float(row["depth_mm"]), float(row[force])] for row in rows if row[force]])
-    except ValueError as fault:
+        return read_loading(text, point, curve)
+    except DesignError as fault:
         raise UsageError(f"{path}: {fault}") from fault
-    return pairs[:, 0], pairs[:, 1]

@@ -77,9 +77,18 @@ def refusal(fault: BaseException) -> dict[str, Any]:
 
 def answer_no(data: Mapping[str, Any], code: int, why: str) -> dict[str, Any]:
     """Return the result of a command whose answer is a no, with what every refusal says; `data` may name findings."""
-    word = {REFUSED: "REFUSED", DEVICE: "DEVICE", OUT_OF_TOLERANCE: "OUT-OF-TOLERANCE"}[code]
-    findings = data.get("findings") or [Finding(word, why).as_dict()]
+    words = {USAGE: "USAGE", REFUSED: "REFUSED", DEVICE: "DEVICE", OUT_OF_TOLERANCE: "OUT-OF-TOLERANCE"}
+    findings = data.get("findings") or [Finding(words.get(code, "FAILED"), why).as_dict()]
     return {"error": why, "exit_code": code, **data, "findings": findings}
+
+
+def no_in_words(data: Mapping[str, Any], why: str) -> Iterator[str]:
+    """Yield for a person what a result that is a no says, where the result itself goes to a program."""
+    yield f"fabctl: {why}"
+    for row in data.get("findings") or ():
+        if row["level"] == "error":
+            found = Finding(row["code"], row["message"], row["level"], row["where"], row["hint"])
+            yield f"  {found}"
 
 
 def _findings(fault: BaseException) -> Iterator[dict[str, Any]]:
@@ -113,6 +122,8 @@ def code_of(fault: BaseException) -> str:
         return "USAGE"
     if isinstance(fault, click.exceptions.Abort | KeyboardInterrupt):
         return "STOPPED"
+    if isinstance(fault.__cause__, OSError) and fault.__cause__.errno in STORAGE:
+        return "STORAGE"
     if isinstance(fault, OSError) and not isinstance(fault, DeviceError):
         return "STORAGE" if fault.errno in STORAGE else "FILE"
     if exit_code_of(fault) == BUG:

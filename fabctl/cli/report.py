@@ -7,11 +7,12 @@ from pathlib import Path
 import click
 
 from fabctl.cli.common import json_option, lab, show
+from fabctl.cli.paths import SPECIMEN, OutFile
 
 
 @click.command("report")
-@click.argument("specimen")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Where to write it [a new report run folder].")
+@click.argument("specimen", type=SPECIMEN)
+@click.option("-o", "--output", type=OutFile(), help="Where to write it [a new report run folder].")
 @json_option
 def command(specimen: str, output: Path | None, as_json: bool) -> None:
     """Write one self-contained HTML file about SPECIMEN: verdict, pattern, curve, deviation map, provenance."""

@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 from fabctl.cli.common import json_option, lab, show
-from fabctl.errors import UsageError
+from fabctl.cli.paths import RUN, SPECIMEN, OutFile
 from fabctl.records.export import export
-from fabctl.records.folder import RunFolder, open_run, status_of
+from fabctl.records.folder import status_of
 from fabctl.records.index import Row, reindex, rows
 
 
@@ -18,22 +18,8 @@ def command() -> None:
     """List, show and export run records."""
 
 
-def find_run(name: str) -> RunFolder:
-    """Return the run that `name` means: its id, the beginning or end of it, or a path."""
-    home = lab()
-    if "/" in name or (Path(name) / "manifest.json").is_file():
-        return open_run(Path(name))
-    folders = [p for p in home.runs.iterdir() if p.is_dir()] if home.runs.is_dir() else []
-    matches = [p for p in folders if p.name == name or p.name.startswith(name) or p.name.endswith(name)]
-    if len(matches) == 1:
-        return open_run(matches[0])
-    if not matches:
-        raise UsageError(f"no run {name!r} in {home.runs}; `fabctl run list` names them")
-    raise UsageError(f"{name!r} may be any of {', '.join(sorted(p.name for p in matches))}")
-
-
 @command.command("list")
-@click.option("--specimen", help="Only the runs of this specimen.")
+@click.option("--specimen", type=SPECIMEN, help="Only the runs of this specimen.")
 @click.option("--kind", help="Only runs of this kind (cut, indent, scan, …).")
 @click.option("--status", help="Only runs that ended so (done, stopped, failed, interrupted, …).")
 @json_option
@@ -53,11 +39,11 @@ def _fits(row: Row, specimen: str | None, kind: str | None, status: str | None) 
 
 
 @command.command("show")
-@click.argument("run")
+@click.argument("run", type=RUN)
 @json_option
 def show_run(run: str, as_json: bool) -> None:
     """Show one run: what was asked, what came out, which files are there."""
-    found = find_run(run)
+    found = lab().run(run)
     manifest, result = found.manifest(), found.result() or {}
     files = sorted(str(p.relative_to(found.path)) for p in found.path.rglob("*") if p.is_file())
     state = status_of(found)
@@ -74,12 +60,12 @@ def show_run(run: str, as_json: bool) -> None:
 
 
 @command.command("export")
-@click.argument("run")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Archive to write [RUN.tar.gz].")
+@click.argument("run", type=RUN)
+@click.option("-o", "--output", type=OutFile(), help="Archive to write [RUN.tar.gz].")
 @json_option
 def export_run(run: str, output: Path | None, as_json: bool) -> None:
     """Pack one run folder into a .tar.gz."""
-    found = find_run(run)
+    found = lab().run(run)
     target = output or Path(f"{found.run_id}.tar.gz")
     hashes = export(found, target)
     show({"archive": str(target), "sha256": hashes}, as_json, [f"{target}: {len(hashes)} files"])

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import bench_option, json_option, lab, progress, say, show
+from fabctl.cli.paths import RUN, SPECIMEN_OR_FILE, InFile, InFolder, config_names
 from fabctl.errors import REFUSED, FabctlError, RefusedError, Stopped, UsageError
 
 if TYPE_CHECKING:
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from fabctl.vision.boards import MarkSheet
     from fabctl.workspace import Specimen, Workspace
 
-FILE = click.Path(path_type=Path, dir_okay=False)
-
 
 @click.group()
 def command() -> None:
@@ -29,8 +28,13 @@ def command() -> None:
 
 
 @command.command("run")
-@click.argument("words", nargs=-1, metavar="[SPECIMEN] [CLOUD]")
-@click.option("--target", type=FILE, help="Target mesh, for a cloud without a specimen.")
+@click.argument("words", nargs=-1, type=SPECIMEN_OR_FILE, metavar="[SPECIMEN] [CLOUD]")
+@click.option("--target", type=InFile(), help="Target mesh, for a cloud without a specimen.")
+@click.option(
+    "--predicted",
+    type=InFile(),
+    help="Deployed shape that a model foresaw, compared as well  [the specimen's deployed.ply].",
+)
 @click.option(
     "--scale",
     type=click.Choice(["free", "known", "markers"]),
@@ -41,19 +45,25 @@ def command() -> None:
 @click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
 @click.option(
     "--markers",
-    type=FILE,
+    type=InFile(),
     help="Markers as scanned: label,x,y,z in cloud units; without it they are looked for in the cloud's colours.",
 )
-@click.option("--board", type=FILE, help="The board as measured: label,x,y,z in mm.")
-@click.option("--bars", type=FILE, help="Scale bars, x1,y1,z1,x2,y2,z2,length_mm: pairs of points in cloud units.")
+@click.option("--board", type=InFile(), help="The board as measured: label,x,y,z in mm.")
+@click.option("--bars", type=InFile(), help="Scale bars, x1,y1,z1,x2,y2,z2,length_mm: pairs of points in cloud units.")
+@click.option("--model", type=InFolder(), help="The scan's COLMAP text model (folder).")
+@click.option("--pictures", type=InFolder(), help="Its pictures  [MODEL/images].")
 @click.option(
-    "--model", type=click.Path(path_type=Path, file_okay=False), help="The scan's COLMAP text model (folder)."
+    "--marks",
+    type=config_names("boards"),
+    default="scale",
+    show_default=True,
+    help="The board whose coded marks the pictures show.",
 )
-@click.option("--pictures", type=click.Path(path_type=Path, file_okay=False), help="Its pictures  [MODEL/images].")
-@click.option("--marks", default="scale", show_default=True, help="The board whose coded marks the pictures show.")
-@click.option("--datum", type=FILE, help="Three or more points as scanned: label,x,y,z in cloud units.")
-@click.option("--datum-target", type=FILE, help="The same points on the target: label,x,y,z in mm.")
-@click.option("--colours", type=FILE, help="Coloured PLY in the target's frame, e.g. an earlier scan's colours.ply.")
+@click.option("--datum", type=InFile(), help="Three or more points as scanned: label,x,y,z in cloud units.")
+@click.option("--datum-target", type=InFile(), help="The same points on the target: label,x,y,z in mm.")
+@click.option(
+    "--colours", type=InFile(), help="Coloured PLY in the target's frame, e.g. an earlier scan's colours.ply."
+)
 @click.option(
     "--mode",
     type=click.Choice(["best-fit", "least-squares", "datum", "rim", "gravity-and-rim"]),
@@ -68,6 +78,7 @@ def command() -> None:
 def run_scan(
     words: tuple[str, ...],
     target: Path | None,
+    predicted: Path | None,
     scale: str,
     unit_mm: float,
     markers: Path | None,
@@ -98,7 +109,10 @@ def run_scan(
         raise UsageError("name a specimen, or give --target")
     if scale != "markers" and (bars or model):
         raise UsageError("--bars and --model belong to --scale markers")
-    predicted = None if specimen is None else specimen.design / "deployed.ply"
+    if pictures is not None and model is None:
+        raise UsageError(f"--pictures {pictures} belongs to --model, the scan's COLMAP text model")
+    if predicted is None and specimen is not None and (specimen.design / "deployed.ply").is_file():
+        predicted = specimen.design / "deployed.ply"
     options: dict[str, Any] = {
         "scale": scale,
         "unit_mm": unit_mm,
@@ -116,18 +130,17 @@ def run_scan(
         "seed": seed,
     }
     if cloud is not None:
-        request = Request(cloud, mesh, predicted if predicted and predicted.is_file() else None, **options)
-        _run(here, request, specimen, as_json)
+        _run(here, Request(cloud, mesh, predicted, **options), specimen, as_json)
         return
     if specimen is None:
         raise UsageError("give the cloud's file")
-    fresh = _fetch(here, bench_name, specimen, seed)
-    _run(here, Request(fresh, mesh, predicted, **options), specimen, as_json)
+    fresh, source = _fetch(here, bench_name, specimen, seed)
+    _run(here, Request(fresh, mesh, predicted, **options), specimen, as_json, source)
 
 
 @command.command("batch")
-@click.argument("clouds", nargs=-1, required=True, type=FILE)
-@click.option("--target", type=FILE, required=True, help="Target mesh of all the clouds.")
+@click.argument("clouds", nargs=-1, required=True, type=InFile())
+@click.option("--target", type=InFile(), required=True, help="Target mesh of all the clouds.")
 @click.option("--scale", type=click.Choice(["free", "known"]), default="free", show_default=True)
 @click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
 @click.option("--tolerance-frac", type=click.FloatRange(min=0, min_open=True), help="Of the bounding-box diagonal.")
@@ -150,7 +163,7 @@ def run_batch(
     for cloud in clouds:
         options: dict[str, Any] = {"scale": scale, "unit_mm": unit_mm, "tolerance_frac": tolerance_frac, "seed": seed}
         try:
-            run, body, code = _compared(here, Request(cloud, target, **options), None)
+            run, body, code = _compared(here, Request(cloud, target, **options), None, {})
         except (RefusedError, UsageError) as fault:  # one bad file must not lose the others
             rows.append(
                 {"cloud": str(cloud), "verdict": "undecided", "error": str(fault), "exit_code": fault.exit_code}
@@ -169,18 +182,17 @@ def run_batch(
 
 
 @command.command("compare")
-@click.argument("first")
-@click.argument("second")
+@click.argument("first", type=RUN)
+@click.argument("second", type=RUN)
 @json_option
 def compare_scans(first: str, second: str, as_json: bool) -> None:
     """Say how well scan run SECOND repeats FIRST: two scans of one specimen, or of one target."""
     from dataclasses import asdict
 
-    from fabctl.records.folder import open_run
     from fabctl.scan.repeat import compare_runs
 
     here = lab()
-    runs = [open_run(Path(name) if Path(name).is_dir() else here.runs / name) for name in (first, second)]
+    runs = [here.run(name) for name in (first, second)]
     found = compare_runs(*runs)
     lines = [
         f"repeatability {found.repeatability_mm:.3f} mm (one scan, bias removed); bias {found.bias_mm:+.3f} mm",
@@ -213,17 +225,18 @@ def _named(here: Workspace, words: tuple[str, ...], target: Path | None) -> tupl
     return here.specimen(words[0]), Path(words[1]) if len(words) == 2 else None
 
 
-def _fetch(here: Workspace, bench_name: str, specimen: Specimen, seed: int) -> Path:
-    """Ask the bench's scanner for a cloud of the specimen; return its file."""
+def _fetch(here: Workspace, bench_name: str, specimen: Specimen, seed: int) -> tuple[Path, dict[str, Any]]:
+    """Ask the bench's scanner for a cloud of the specimen; return its file, and who made it, for the record."""
     from fabctl.bench import open_bench
     from fabctl.config.bench import load_bench
 
     config = load_bench(bench_name, here.root)
     if config.scan is None:
         raise UsageError(f"bench {config.name} has no scan section; give the cloud's file")
+    source = {"bench": config.name, "simulated": config.is_simulated}
     with open_bench(here, config, f"scan of {specimen.name}") as bench:
         if config.scan.inbox is not None:
-            return _newest(Path(config.scan.inbox.replace("{state}", str(bench.state))))
+            return _newest(Path(config.scan.inbox.replace("{state}", str(bench.state)))), source
         assert config.scan.command is not None
         bench.lay(specimen.design)
         out = bench.state / "scans" / f"{specimen.name}-{seed}.ply"
@@ -242,7 +255,7 @@ def _fetch(here: Workspace, bench_name: str, specimen: Specimen, seed: int) -> P
         done = subprocess.run(asked, capture_output=True, text=True, check=False)
         if done.returncode or not out.is_file():
             raise _ScannerFailed(f"the scanner made no cloud (exit {done.returncode}): {done.stderr.strip()[-500:]}")
-        return out
+        return out, source
 
 
 class _ScannerFailed(FabctlError):
@@ -260,15 +273,19 @@ def _newest(inbox: Path) -> Path:
     return max(found, key=lambda p: p.stat().st_mtime)
 
 
-def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: bool) -> None:
-    """Compare, write the run record, show the result; return the exit code."""
-    run, body, code = _compared(here, request, specimen)
+def _run(
+    here: Workspace, request: Request, specimen: Specimen | None, as_json: bool, source: dict[str, Any] | None = None
+) -> None:
+    """Compare, write the run record, show the result; a no ends with its exit code."""
+    run, body, code = _compared(here, request, specimen, source or {})
     page = run.artefact("report.html")
     data = {"run": run.run_id, "folder": str(run.path), "report": str(page), **body}
     show(data, as_json, _lines(body, page), code, _sentence(body))
 
 
-def _compared(here: Workspace, request: Request, specimen: Specimen | None) -> tuple[RunFolder, dict[str, Any], int]:
+def _compared(
+    here: Workspace, request: Request, specimen: Specimen | None, source: dict[str, Any]
+) -> tuple[RunFolder, dict[str, Any], int]:
     """Compare and write the run record; return it with the result and the exit code."""
     from fabctl.records.folder import start_run
     from fabctl.reports.scan import write_scan_report
@@ -278,7 +295,7 @@ def _compared(here: Workspace, request: Request, specimen: Specimen | None) -> t
     if missing:
         raise UsageError(f"no such file: {', '.join(missing)}")
     name = None if specimen is None else specimen.name
-    config = {k: getattr(request, k) for k in ("scale", "unit_mm", "mode", "tolerance_frac")}
+    config = {k: getattr(request, k) for k in ("scale", "unit_mm", "mode", "tolerance_frac")} | source
     run = start_run(here.runs, "scan", specimen=name, inputs=request.files(), config=config, seed=request.seed)
     log, live = run.log_events(), progress()
 

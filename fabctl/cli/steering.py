@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import select
+import shutil
 import signal
 import sys
+import textwrap
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +16,11 @@ import click
 from fabctl.events import Emit, Event
 
 if TYPE_CHECKING:
-    from fabctl.indent.run import Wish
+    from fabctl.indent.sampling import Wish
 
 PLOT_COLUMNS, PLOT_ROWS = 60, 12
+LABEL_COLUMNS, OTHER_ROWS = 11, 6  # beside the plot; and above and below it, so that a message is not pushed out
+POINTS_COUNT = 1500  # of the drawn curve: more would hold up the sampling that draws it
 DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 
 
@@ -41,7 +45,6 @@ class Keys:
 
             self._terminal = termios.tcgetattr(sys.stdin)
             tty.setcbreak(sys.stdin)
-            click.echo("space: pause   s or Ctrl-C: stop", err=True)
         return self
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
@@ -75,39 +78,62 @@ class Keys:
             return True
         if message != self._asked:
             self._asked, self._answered = message, False
-            click.echo(f"\r\x1b[2K{message}   [Enter]", err=True)
         self.wish()
-        return self._answered
+        if self._answered:
+            self._asked = ""
+            return True
+        return False
 
     def listen(self, event: Event) -> None:
         """Show an event; on a terminal also the growing curve."""
         if event.kind == "progress" and self._terminal is not None and sys.stderr.isatty():
             self._draw(event)
         else:
+            click.echo(self._erased(), err=True, nl=False)
             self._listener(event)
 
     def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
         if self._wish == "stop":
             raise KeyboardInterrupt
         self._wish = "stop"
+        self._drawn_rows = 0
         click.echo("\nstopping; once more interrupts at once", err=True)
 
     def _draw(self, event: Event) -> None:
+        self._grow(event)
+        size = shutil.get_terminal_size()
+        columns, rows = min(PLOT_COLUMNS, size.columns - LABEL_COLUMNS), min(PLOT_ROWS, size.lines - OTHER_ROWS)
+        plot = braille(self._curve, columns, rows) if len(self._curve) > 1 and columns > 9 and rows > 3 else []
+        lines = [*plot, f"{event.done_frac or 0:6.1%}  {event.message}", *self._hints(size.columns - 1)]
+        click.echo(self._erased() + "".join(f"{line[: size.columns - 1]}\n" for line in lines), err=True, nl=False)
+        self._drawn_rows = len(lines)
+
+    def _grow(self, event: Event) -> None:
         depth, force = event.data.get("depth_mm"), event.data.get("force_N")
         if event.data.get("step") in ("load", "unload") and depth is not None and force is not None:
             self._curve.append((depth, force))
+            if len(self._curve) > POINTS_COUNT:
+                del self._curve[::2]
         elif event.data.get("step") in ("approach", "travel"):
             self._curve.clear()
-        lines = [*braille(self._curve), f"{event.done_frac or 0:6.1%}  {event.message}"]
-        up = f"\x1b[{self._drawn_rows}F" if self._drawn_rows else ""
-        click.echo(up + "".join(f"\x1b[2K{line}\n" for line in lines), err=True, nl=False)
-        self._drawn_rows = len(lines)
+
+    def _hints(self, columns: int) -> list[str]:
+        """Return what the operator may press now."""
+        if self._wish == "stop":
+            return ["stopping"]
+        if self._asked:
+            return textwrap.wrap(f"{self._asked}  [Enter: go on, s: stop]", max(20, columns))
+        return ["space: go on   s: stop" if self._wish == "pause" else "space: pause   s: stop"]
+
+    def _erased(self) -> str:
+        """Return what takes the drawn lines away, so that what is told next stands above the new ones and stays."""
+        up = f"\x1b[{self._drawn_rows}F\x1b[J" if self._drawn_rows else ""
+        self._drawn_rows = 0
+        return up
 
 
 def braille(points: list[tuple[float, float]], columns: int = PLOT_COLUMNS, rows: int = PLOT_ROWS) -> list[str]:
-    """Return a curve as lines of braille dots, with its ranges at the side."""
-    if len(points) < 2:
-        return [""] * rows
+    """Return a curve as lines of braille dots with its forces at the side, and a line with its depths."""
     xs, ys = [p[0] for p in points], [p[1] for p in points]
     low_x, high_x, low_y, high_y = min(xs), max(xs), min(ys), max(ys)
     cells = [[0] * columns for _ in range(rows)]
@@ -117,5 +143,6 @@ def braille(points: list[tuple[float, float]], columns: int = PLOT_COLUMNS, rows
         cells[down // 4][across // 2] |= DOTS[down % 4][across % 2]
     lines = ["".join(chr(0x2800 + cell) for cell in row) for row in cells]
     lines[0] += f" {high_y:.3f} N"
-    lines[-1] += f" {low_y:.3f} N   {low_x:.2f} to {high_x:.2f} mm"
-    return lines
+    lines[-1] += f" {low_y:.3f} N"
+    left, right = f"{low_x:.2f}", f"{high_x:.2f} mm"
+    return [*lines, left + right.rjust(columns - len(left))]

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from fabctl.cli.common import json_option, show
+from fabctl.cli.paths import InFile, OutFile
 from fabctl.errors import UsageError
 
 
@@ -30,7 +31,13 @@ def list_targets(as_json: bool) -> None:
 
 @command.command("make")
 @click.argument("name")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="OBJ, PLY or STL file to write.")
+@click.option(
+    "-o",
+    "--output",
+    type=OutFile((".obj", ".ply", ".stl"), "a mesh"),
+    required=True,
+    help="OBJ, PLY or STL file to write.",
+)
 @click.option("--radius-mm", type=click.FloatRange(1), help="Radius of the sphere, disk or tube.")
 @click.option("--height-mm", type=click.FloatRange(0), help="Height of the hills or of the tube.")
 @click.option("--half-angle-deg", type=click.FloatRange(5, 150), help="Half-angle of a cap.")
@@ -65,7 +72,7 @@ def make_target(
 
 
 @command.command("check")
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=InFile())
 @json_option
 def check_target(path: Path, as_json: bool) -> None:
     """Read a mesh file as a target and say everything that is wrong or doubtful about it."""

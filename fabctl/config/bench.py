@@ -66,7 +66,13 @@ class BenchConfig(Model):
     camera: CameraConfig | None = None
     specimen_slot: str | None = None
     deployment: Literal["by_hand", "automatic"] = "by_hand"
+    simulated: bool = False
     simulators: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Return whether its devices are simulators: the file says so, or lists them."""
+        return self.simulated or bool(self.simulators)
 
 
 def find(kind: str, name: str, home: Path) -> Path:
@@ -74,13 +80,22 @@ def find(kind: str, name: str, home: Path) -> Path:
     direct = Path(name)
     if direct.suffix in (".yaml", ".yml") and direct.is_file():
         return direct
-    places = [home / "configs" / kind, Path(__file__).resolve().parents[2] / "configs" / kind]
-    for place in places:
+    for place in _places(kind, home):
         path = place / f"{name}.yaml"
         if path.is_file():
             return path
-    known = sorted({p.stem for place in places if place.is_dir() for p in place.glob("*.yaml")})
-    raise ConfigError([f"{name}: no such file, nor a name in configs/{kind} (known: {', '.join(known) or 'none'})"])
+    wrong = "is a folder" if direct.is_dir() else "is no YAML file" if direct.is_file() else "no such file"
+    known = ", ".join(names(kind, home)) or "none"
+    raise ConfigError([f"{name}: {wrong}, nor a name in configs/{kind} (known: {known})"])
+
+
+def names(kind: str, home: Path) -> list[str]:
+    """Return the names that `find` knows without a path."""
+    return sorted({path.stem for place in _places(kind, home) for path in place.glob("*.yaml")})
+
+
+def _places(kind: str, home: Path) -> tuple[Path, Path]:
+    return home / "configs" / kind, Path(__file__).resolve().parents[2] / "configs" / kind
 
 
 def load_bench(name: str, home: Path) -> BenchConfig:

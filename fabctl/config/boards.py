@@ -12,7 +12,8 @@ from pydantic import Field, model_validator
 from fabctl.config.bench import Positive, find
 from fabctl.config.loader import Model, load
 from fabctl.records.folder import write_atomically
-from fabctl.vision.boards import Charuco, Mark, MarkSheet
+from fabctl.vision.boards import CHARUCO_IDS, Charuco, Mark, MarkSheet
+from fabctl.vision.markers import codes
 
 Count = Annotated[int, Field(ge=2)]
 Id = Annotated[int, Field(ge=0)]
@@ -40,12 +41,18 @@ class BoardConfig(Model):
     rows_count: Count | None = None
     square_mm: Positive | None = None
     marker_mm: Positive | None = None
+    first_id: Id = CHARUCO_IDS.start  # of a ChArUco board that another program drew, usually 0
+    legacy: bool = False  # such a board of an even number of rows whose upper left square is white
     marks: tuple[MarkConfig, ...] = ()
 
     @model_validator(mode="after")
     def _complete(self) -> BoardConfig:
         if self.kind == "charuco" and None in (self.columns_count, self.rows_count, self.square_mm, self.marker_mm):
             raise ValueError("a charuco board needs columns_count, rows_count, square_mm and marker_mm")
+        if self.kind == "charuco" and self.columns_count and self.rows_count:
+            last, most = self.first_id + self.columns_count * self.rows_count // 2 - 1, len(codes(self.family)) - 1
+            if last > most:
+                raise ValueError(f"the board's markers go up to {last}, {self.family} ends at {most}")
         if self.kind == "marks" and not self.marks:
             raise ValueError("a sheet of marks needs marks")
         ids = [mark.id for mark in self.marks]
@@ -60,8 +67,9 @@ class BoardConfig(Model):
         if self.columns_count is None or self.rows_count is None or self.square_mm is None or self.marker_mm is None:
             raise ValueError(f"{self.name} is not a charuco board")
         ratio = math.sqrt(math.prod(self.ratios()))
+        square, marker = self.square_mm * ratio, self.marker_mm * ratio
         return Charuco(
-            self.name, self.columns_count, self.rows_count, self.square_mm * ratio, self.marker_mm * ratio, self.family
+            self.name, self.columns_count, self.rows_count, square, marker, self.family, self.first_id, self.legacy
         )
 
     def mark_sheet(self) -> MarkSheet:
@@ -91,6 +99,8 @@ def config_of(board: Charuco | MarkSheet) -> BoardConfig:
             rows_count=board.rows_count,
             square_mm=board.square_mm,
             marker_mm=board.marker_mm,
+            first_id=board.first_id,
+            legacy=board.legacy,
         )
     marks = tuple(
         MarkConfig(id=m.id, x_mm=m.x_mm, y_mm=m.y_mm, side_mm=m.side_mm, turn_deg=math.degrees(m.turn_rad))

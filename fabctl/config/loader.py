@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from fabctl.errors import ConfigError
+from fabctl.errors import ConfigError, UsageError
+from fabctl.files import text_of
 
 INT = re.compile(r"[-+]?[0-9]+")
 FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
@@ -36,14 +37,9 @@ M = TypeVar("M", bound=BaseModel)
 def load(path: Path, model: type[M]) -> M:
     """Return the file at `path` as `model`; raise `ConfigError` with all complaints, each `file:line: key: what`."""
     try:
-        text = path.read_bytes().decode()
-    except FileNotFoundError:
-        raise ConfigError([f"{path}: no such file"]) from None
-    except IsADirectoryError:
-        raise ConfigError([f"{path}: is a folder, not a YAML file"]) from None
-    except (OSError, UnicodeDecodeError) as fault:
-        raise ConfigError([f"{path}: cannot be read as text: {fault}"]) from fault
-    return parse(text, model, str(path))
+        return parse(text_of(path, "a YAML file"), model, str(path))
+    except UsageError as fault:
+        raise ConfigError([str(fault)]) from fault
 
 
 def parse(text: str, model: type[M], name: str) -> M:

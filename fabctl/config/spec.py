@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from design.cells.select import Rule, SelectionOptions
 from design.flatten import FlattenOptions
-from design.flatten.result import Boundary, SeamChoice
+from design.flatten.result import Boundary, HoleChoice, SeamChoice
 from design.pattern.assign import Averaging, ScaleOptions, Which
 from design.pattern.border import BorderOptions
 from design.pattern.slits import HingeOptions, HingeRule
 from design.pattern.tiling import Placement
 from design.pattern.toolpath import Sides, ToolOptions
-from design.spec import DesignSpec, Infeasible, Kind, Region, ResponseOptions
+from design.spec import DesignSpec, Infeasible, Kind, Region, ResponseOptions, Rim
 from fabctl.config.bench import Positive, find
 from fabctl.config.loader import Model, load
 
 Length = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 Count = Annotated[int, Field(ge=0)]
+Point = tuple[float, float, float]
 
 
 class MadeTarget(Model):
@@ -43,17 +44,26 @@ class MadeTarget(Model):
 
 
 class FlattenConfig(Model):
-    """How the surface is laid flat."""
+    """How the surface is laid flat; with `source: target` the OBJ's own texture coordinates are its flat, in mm."""
 
+    source: Literal["computed", "target"] = "computed"
     boundary: Boundary = "isometric"
     modes_count: Count = 24
+    holes: HoleChoice = "auto"
     seam: SeamChoice = "auto"
+    cut_mm: Annotated[tuple[Point, ...], Field(min_length=2)] | None = None
     cones_count: Count = 0
 
     @model_validator(mode="after")
     def _no_values_here(self) -> FlattenConfig:
         if self.boundary == "prescribed":
             raise ValueError("a prescribed boundary needs values per vertex; it is for programs, not for this file")
+        return self
+
+    @model_validator(mode="after")
+    def _given_is_taken_as_it_is(self) -> FlattenConfig:
+        if self.source == "target" and self.model_fields_set != {"source"}:
+            raise ValueError("`source: target` takes the file's flat as it is; no other key of `flatten` applies")
         return self
 
 
@@ -149,7 +159,7 @@ class SpecConfig(Model):
     border: BorderConfig = BorderConfig()
     tool: ToolConfig = ToolConfig()
     bed_mm: tuple[Positive, Positive] | None = None
-    compensate: bool = False
+    compensate: bool | Rim = False
     response: ResponseConfig | None = ResponseConfig()
 
     @model_validator(mode="after")
@@ -177,7 +187,7 @@ class SpecConfig(Model):
             name=self.name,
             cells=self.cells,
             cell_mm=cell_mm,
-            flatten=FlattenOptions(**self.flatten.model_dump()),
+            flatten=FlattenOptions(**self.flatten.model_dump(exclude={"source", "cut_mm"})),
             infeasible=self.infeasible,
             averaging=self.averaging,
             scale=ScaleOptions(self.scale.end, self.scale.high_ratio),

@@ -106,7 +106,9 @@ class BedEye:
     def look_again(self) -> None:
         """Raise `RefusedError` where the sheet no longer lies where the job was planned for."""
         if self.again:
-            now = find_sheet(self.state, _fresh(self.take()), self.board, self.thickness_mm)
+            frame = _fresh(self.take())
+            _refuse_same(self.found.picture, frame)
+            now = find_sheet(self.state, frame, self.board, self.thickness_mm)
             _refuse_moved(self.found.registration, now.registration, "since the job was planned")
 
     def record(self, run: RunFolder, plan: CutPlan) -> None:
@@ -141,6 +143,16 @@ def _fresh(frame: Frame) -> Frame:
         finding = Finding("PICTURE-OLD", text, where=frame.source, hint="take a picture of the bed as it is now")
         raise RefusedError("the bed picture cannot be cut by", [finding])
     return frame
+
+
+def _refuse_same(before: Frame, now: Frame) -> None:
+    """Raise `RefusedError` where a second look gives the very same picture: no two of a living camera are equal."""
+    if np.array_equal(before.image, now.image):
+        text = "the second look at the bed is the very same picture as the first, so it does not show the bed of now"
+        hint = "is the camera frozen? restart it; a folder must get a new picture while the question stands"
+        raise RefusedError(
+            "the bed picture cannot be cut by", [Finding("PICTURE-SAME", text, where=now.source, hint=hint)]
+        )
 
 
 def _refuse_moved(before: Registration, now: Registration, since: str) -> None:

@@ -5,7 +5,6 @@ The work offset is only read, never written: the program itself is moved, so tha
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from drivers.grbl.messages import Vector
 from drivers.grbl.settings import Identity
 from fabctl.cut.program import WORD, decimal, read_program, strip
 from fabctl.errors import UsageError
+from fabctl.files import json_of
 
 Origin = Literal["here", "home", "camera"]
 RIGID_RATIO = 0.02  # a camera map that stretches more than this is a mistake, not a bed
@@ -99,12 +99,12 @@ def placement(
 
 def read_affine(path: Path) -> Affine:
     """Return the map in a JSON file: `sheet_to_machine`, two rows of three numbers."""
+    data = json_of(path, "a map from sheet to machine")
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        rows = data["sheet_to_machine"] if isinstance(data, dict) else data
+        rows = data["sheet_to_machine"]
         (a, b, c), (d, e, f) = ([float(value) for value in row] for row in rows)
-    except (OSError, ValueError, KeyError, TypeError) as fault:
-        raise UsageError(f"{path}: no sheet_to_machine of two rows with three numbers: {fault}") from fault
+    except (ValueError, KeyError, TypeError) as fault:
+        raise UsageError(f"{path}: no sheet_to_machine of two rows with three numbers") from fault
     if not all(map(math.isfinite, (a, b, c, d, e, f))):
         raise UsageError(f"{path}: the map is not finite")
     scale = math.sqrt(abs(a * e - b * d))

@@ -89,6 +89,8 @@ def strokes_of(samples: Samples) -> list[tuple[int, int, Strokes]]:
         load, unload, hold = (own & (samples.step == step) for step in ("load", "unload", "hold"))
         if load.sum() < 10:
             continue
+        zeroed = np.flatnonzero((samples.point == point) & (samples.step == "zero"))
+        zeroed = zeroed[zeroed < np.flatnonzero(load)[0]]
         found.append(
             (
                 point,
@@ -100,6 +102,8 @@ def strokes_of(samples: Samples) -> list[tuple[int, int, Strokes]]:
                     samples.force_N[unload],
                     samples.time_s[hold],
                     samples.force_N[hold],
+                    float(samples.position_mm[zeroed[-1]]) if len(zeroed) else None,
+                    float(samples.force_N[zeroed[-1]]) if len(zeroed) else 0.0,
                 ),
             )
         )
@@ -145,9 +149,11 @@ def _one(numbered: Numbered) -> dict[str, Any]:
         "curve": numbered.curve,
         "contact_mm": contact.position_mm,
         "contact_se_mm": contact.se_mm,
+        "counted_from": contact.kind,
         "contact_spread_mm": contact.spread_mm,
         "contact_others_mm": dict(contact.others_mm),
         "noise_N": contact.noise_N,
+        "drift_N_mm": contact.drift_N_mm,
         "depth_max_mm": result.depth_max_mm,
         "not_found": dict(result.reasons),
     }

@@ -12,20 +12,20 @@ is found by scanning the residual, with its standard error. The others are compu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fabctl.indent.freepart import FREE_MIN, WIDTH, Free, find_free
+
 Reals = NDArray[np.float64]
 
 SLOPED, HERTZIAN = (1.0, 2.0, 3.0), (1.5, 2.5, 3.5)
+RISE = 2  # the column of the first power: how the force begins
 CLEARLY = 12.0  # by how much chi² must fall before a Hertzian start is believed instead of a sloped one
-FREE_MIN = 12  # samples of the free part, for its level and noise
-SIGNAL = 8.0  # the force must exceed the noise by this factor
 MISFIT_SIGMA = 4.0  # a window is too long where chi² exceeds its mean by so many of its standard deviations
 AGREE_SIGMA = 1.5  # and where its contact lies outside so many standard errors of a shorter window's
-DRIFT_N_MM = 2e-3  # how much the free part is expected to slope: drift over speed
 WINDOWS = (0.15, 0.25, 0.4, 0.6, 0.85)  # of the way from the guess to the first maximum
 ENOUGH_COUNT, THIN_MM = 350, 0.02  # more samples than this are averaged over at most so much of the stroke
 TOUCH_COUNT, TOUCH_MM = 80, 0.1  # for the quick look during an approach
@@ -38,7 +38,9 @@ class Contact:
     """Where contact is, how sure that is, and what the other estimators say.
 
     `position_mm` is None where it was not found; `reason` says why. `slope_N_mm` is the stiffness at contact with its
-    standard error; None for a Hertzian start, which has none.
+    standard error; None for a Hertzian start, which has none. `drift_N_mm` is the slope of the free part where it is
+    evident, else 0. `kind` is `zero` where the curve begins under a preload and depth is counted from the method's
+    zero, at which the force was `start_N`.
     """
 
     position_mm: float | None
@@ -50,6 +52,8 @@ class Contact:
     noise_N: float = 0.0
     baseline_N: float = 0.0
     baseline_N_mm: float = 0.0
+    drift_N_mm: float = 0.0
+    start_N: float = 0.0
     others_mm: tuple[tuple[str, float], ...] = ()
 
     @property
@@ -75,16 +79,17 @@ class Fit:
 def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
     """Return the contact on a loading curve; `position_mm` (n,) rises, the frame's give already taken off."""
     u, f = _thinned(position_mm, force_N, ENOUGH_COUNT, THIN_MM)
-    guess = _guess(u, f)
-    if isinstance(guess, str):
-        return Contact(None, guess)
-    start, level_N, noise_N = guess
-    others = _opinions(u, f, start, level_N, noise_N)
-    best = _best_fit(u, f, start, noise_N)
+    free = find_free(u, f)
+    if isinstance(free, str):
+        return Contact(None, free)
+    level_N, noise_N = free.level_N, free.noise_N
+    others = _opinions(u, f, free.start, level_N, noise_N)
+    best = _best_fit(u, f, free)
     if best is None:
         reason = "no window after the rise is long enough to fit"
         return Contact(None, reason, noise_N=noise_N, baseline_N=level_N, others_mm=others)
-    se_mm = best.se_mm
+    # Between two samples nothing is known of how the contact begins.
+    se_mm = float(np.hypot(best.se_mm, np.median(np.diff(u)) / np.sqrt(12)))
     sloped = best.powers == SLOPED
     found = Contact(
         best.contact_mm,
@@ -95,6 +100,7 @@ def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
         noise_N=noise_N,
         baseline_N=float(best.coefficients[0]),
         baseline_N_mm=float(best.coefficients[1]),
+        drift_N_mm=free.slope_N_mm,
         others_mm=others,
     )
     if se_mm > SE_MAX_MM:
@@ -109,11 +115,11 @@ def first_touch(position_mm: Reals, force_N: Reals) -> float | None:
     Quick, some milliseconds: it is asked between two samples, while a watchdog waits for the next.
     """
     u, f = _thinned(position_mm, force_N, TOUCH_COUNT, TOUCH_MM)
-    guess = _guess(u, f)
-    if isinstance(guess, str):
+    free = find_free(u, f)
+    if isinstance(free, str):
         return None
-    start, _, noise_N = guess
-    return _scan(u, f, float(u[start]), float(u[-1] - u[start]) + 1.0, 0.2, SLOPED, noise_N).contact_mm
+    at_mm = float(u[free.start])
+    return _scan(u, f, at_mm, float(u[-1]) - at_mm + 1.0, 0.2, SLOPED, free).contact_mm
 
 
 def _thinned(u: Reals, f: Reals, enough_count: int, most_mm: float) -> tuple[Reals, Reals]:
@@ -126,52 +132,40 @@ def _thinned(u: Reals, f: Reals, enough_count: int, most_mm: float) -> tuple[Rea
     return u[:kept].reshape(-1, many).mean(axis=1), f[:kept].reshape(-1, many).mean(axis=1)
 
 
-def _guess(u: Reals, f: Reals) -> tuple[int, float, float] | str:
-    """Return (index of the first sure rise, free level, noise), or why there is none."""
-    if len(u) < 3 * FREE_MIN:
-        return f"only {len(u)} samples in the loading"
-    head = f[:FREE_MIN]
-    noise = max(float(np.std(np.diff(head)) / np.sqrt(2)), 1e-6)
-    top = float(np.convolve(f, np.full(8, 1 / 8), "valid").max())
-    if top - np.median(head) < SIGNAL * noise / np.sqrt(8):
-        return f"the force never leaves the noise of {1000 * noise:.1f} mN"
-    # The free part grows as long as the running mean of a few samples stays in its band.
-    width = 8
-    mean = np.convolve(f, np.full(width, 1 / width), "valid")
-    level = float(np.median(head))
-    for _ in range(3):
-        band = 4.5 * noise / np.sqrt(width) + 0.004 * (f.max() - level)
-        over = np.flatnonzero(mean - level > band)
-        if not len(over):
-            return "the force never rises steadily"
-        start = int(over[0])
-        if start < FREE_MIN:
-            return "the curve begins in contact: there is no free part before it"
-        free = f[:start]
-        level = float(np.median(free))
-        noise = max(float(np.std(np.diff(free)) / np.sqrt(2)), 1e-6)
-    return start, level, noise
-
-
-def _best_fit(u: Reals, f: Reals, start: int, noise_N: float) -> Fit | None:
+def _best_fit(u: Reals, f: Reals, free: Free) -> Fit | None:
     """Return the fit over the longest window that the model still follows and that agrees with all shorter ones."""
+    start = free.start
     top = start + int(np.argmax(f[start:]))
     span_mm = float(u[top] - u[start])
+    # Where samples lie far apart the mean that showed the rise began far before it.
+    after_mm = max(0.5, WIDTH * float(np.median(np.diff(u))))
     taken: list[Fit] = []
+    shorter: list[dict[tuple[float, ...], Fit]] = []
     for part in WINDOWS:
         end = int(np.searchsorted(u, u[start] + part * span_mm))
         if end - start < 4 * len(SLOPED) and part != WINDOWS[-1]:
             continue
-        around = (float(u[start]), 2.5, 0.5) if not taken else (taken[-1].contact_mm, 0.6, 0.6)
-        sloped = _scan(u[:end], f[:end], *around, SLOPED, noise_N)
-        hertzian = _scan(u[:end], f[:end], *around, HERTZIAN, noise_N)
-        found = hertzian if _is_hertzian(sloped, hertzian) else sloped
+        around = (float(u[start]), 2.5, after_mm) if not taken else (taken[-1].contact_mm, 0.6, 0.6)
+        sloped = _scan(u[:end], f[:end], *around, SLOPED, free)
+        hertzian = _scan(u[:end], f[:end], *around, HERTZIAN, free)
+        found = _chosen(sloped, hertzian)
         misfit = (found.chi2 - found.count) / np.sqrt(2 * found.count)
-        agrees = all(abs(found.contact_mm - shorter.contact_mm) <= AGREE_SIGMA * shorter.se_mm for shorter in taken)
+        # With what the same kind of start said before: that a longer window shows the kind is no disagreement.
+        before = [kinds[found.powers] for kinds in shorter]
+        agrees = all(abs(found.contact_mm - one.contact_mm) <= AGREE_SIGMA * one.se_mm for one in before)
         if taken and taken[-1].se_mm < SE_GOOD_MM and (misfit > MISFIT_SIGMA or not agrees):
             break
         taken.append(found)
+        shorter.append({SLOPED: sloped, HERTZIAN: hertzian})
     return taken[-1] if taken else None
+
+
+def _chosen(sloped: Fit, hertzian: Fit) -> Fit:
+    """Return the start that is believed; its error holds how far the other one lies off, as likely as that one is."""
+    found, other = (hertzian, sloped) if _is_hertzian(sloped, hertzian) else (sloped, hertzian)
+    weight = 1 / (1 + float(np.exp(np.clip((other.chi2 - found.chi2) / 2, -50, 50))))
+    apart_mm = weight * (other.contact_mm - found.contact_mm)
+    return replace(found, se_mm=float(np.hypot(found.se_mm, apart_mm)))
 
 
 def _is_hertzian(sloped: Fit, hertzian: Fit) -> bool:
@@ -182,39 +176,43 @@ def _is_hertzian(sloped: Fit, hertzian: Fit) -> bool:
 
 
 def _scan(
-    u: Reals, f: Reals, around_mm: float, before_mm: float, after_mm: float, powers: tuple[float, ...], noise_N: float
+    u: Reals, f: Reals, around_mm: float, before_mm: float, after_mm: float, powers: tuple[float, ...], free: Free
 ) -> Fit:
     """Return the least-squares fit over the contact point: a scan, then a refinement by halving."""
     low = max(float(u[FREE_MIN // 2]), around_mm - before_mm)
     high = max(min(around_mm + after_mm, float(u[-2 * len(powers)])), low + 0.1)
     grid = np.linspace(low, high, max(9, round((high - low) / 0.08)))
     step = grid[1] - grid[0]
-    costs = [_cost(u, f, c, powers, noise_N) for c in grid]
+    costs = [_cost(u, f, c, powers, free) for c in grid]
     # Of a flat valley the curvature at its bottom says too little: what lies within 2σ of the best counts.
-    likely = grid[np.array(costs) < min(costs) + 4 * noise_N**2]
+    likely = grid[np.array(costs) < min(costs) + 4 * free.noise_N**2]
     valley_mm = float(np.ptp(likely)) / 4
     middle = float(grid[int(np.argmin(costs))])
     while step > 1e-3:
         step /= 2.5
         trial = [middle + k * step for k in (-2, -1, 0, 1, 2)]
-        costs = [_cost(u, f, c, powers, noise_N) for c in trial]
+        costs = [_cost(u, f, c, powers, free) for c in trial]
         middle = trial[int(np.argmin(costs))]
-    return _fit_at(u, f, middle, powers, noise_N, valley_mm)
+    return _fit_at(u, f, middle, powers, free, valley_mm)
 
 
-def _fit_at(u: Reals, f: Reals, contact_mm: float, powers: tuple[float, ...], noise_N: float, valley_mm: float) -> Fit:
-    design, wanted = _system(u, f, contact_mm, powers, noise_N)
+def _fit_at(u: Reals, f: Reals, contact_mm: float, powers: tuple[float, ...], free: Free, valley_mm: float) -> Fit:
+    design, wanted = _system(u, f, contact_mm, powers, free)
     coefficients = np.linalg.lstsq(design, wanted, rcond=None)[0].astype(np.float64)
+    if coefficients[RISE] < 0:
+        coefficients = np.insert(np.linalg.lstsq(np.delete(design, RISE, 1), wanted, rcond=None)[0], RISE, 0.0)
     residual = wanted - design @ coefficients
     away = np.maximum(u - contact_mm, 1e-9)
     slope = sum(-a * p * away ** (p - 1) * (u > contact_mm) for a, p in zip(coefficients[2:], powers, strict=True))
     jacobian = np.column_stack([design, np.append(slope, 0.0)])
-    covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13) * noise_N**2
+    covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13) * free.noise_N**2
     se_mm = max(float(np.sqrt(covariance[-1, -1])), valley_mm)
-    return Fit(contact_mm, powers, coefficients, covariance, se_mm, float(residual @ residual) / noise_N**2, len(u))
+    return Fit(
+        contact_mm, powers, coefficients, covariance, se_mm, float(residual @ residual) / free.noise_N**2, len(u)
+    )
 
 
-def _system(u: Reals, f: Reals, contact_mm: float, powers: Sequence[float], noise_N: float) -> tuple[Reals, Reals]:
+def _system(u: Reals, f: Reals, contact_mm: float, powers: Sequence[float], free: Free) -> tuple[Reals, Reals]:
     """Return columns and right side; a last row expects the free part to slope by no more than the drift."""
     away = np.maximum(u - contact_mm, 0.0)
     design = np.zeros((len(u) + 1, 2 + len(powers)))
@@ -222,15 +220,20 @@ def _system(u: Reals, f: Reals, contact_mm: float, powers: Sequence[float], nois
     design[:-1, 1] = u - contact_mm
     for k, power in enumerate(powers):
         design[:-1, 2 + k] = away**power
-    design[-1, 1] = noise_N / DRIFT_N_MM
+    design[-1, 1] = free.noise_N / free.drift_N_mm
     return design, np.append(f, 0.0)
 
 
-def _cost(u: Reals, f: Reals, contact_mm: float, powers: Sequence[float], noise_N: float) -> float:
-    design, wanted = _system(u, f, contact_mm, powers, noise_N)
+def _cost(u: Reals, f: Reals, contact_mm: float, powers: Sequence[float], free: Free) -> float:
+    design, wanted = _system(u, f, contact_mm, powers, free)
     # Normal equations: four times faster than an orthogonal solution, and the columns are scaled to keep them sound.
     scaled = design / (np.sqrt((design**2).sum(axis=0)) + 1e-300)
-    weights = np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(scaled.shape[1]), scaled.T @ wanted)
+    square, right = scaled.T @ scaled + 1e-12 * np.eye(scaled.shape[1]), scaled.T @ wanted
+    weights = np.linalg.solve(square, right)
+    if weights[RISE] < 0:
+        # No specimen pulls the indenter in where it is touched: such a fit follows the noise before contact.
+        less = np.delete(np.delete(square, RISE, 0), RISE, 1)
+        weights = np.insert(np.linalg.solve(less, np.delete(right, RISE)), RISE, 0.0)
     residual = wanted - scaled @ weights
     return float(residual @ residual)
 

@@ -11,24 +11,18 @@ import numpy as np
 
 from fabctl.errors import RecordError, UsageError
 from fabctl.indent.analysis import Numbered, analyse, conditioning_curves, read_samples, summarise_run
-from fabctl.indent.compare import bca, describe, fieller
+from fabctl.indent.compare import Ratio, bca, describe, fieller
 from fabctl.indent.plot import draw_curves
-from fabctl.records.folder import RunFolder, open_run, status_of
+from fabctl.records.folder import RunFolder, status_of
 from fabctl.workspace import SPECIMEN, Workspace
 
 COMPARED = ("stiffness_initial_N_mm", "stiffness_secant_N_mm", "force_max_N", "load_energy_mJ", "barrier_mJ")
 
 
-def find_run(lab: Workspace, name: str) -> RunFolder:
-    """Return one run by its id or folder."""
-    path = Path(name)
-    return open_run(path if path.is_dir() else lab.runs / name)
-
-
 def find_runs(lab: Workspace, name: str) -> list[RunFolder]:
     """Return the runs a word means: a run, or all tests of a specimen that hold samples."""
     if not SPECIMEN.fullmatch(name):
-        return [find_run(lab, name)]
+        return [lab.run(name)]
     found = [run for run in lab.runs_of(name, "indent") if (run.path / "samples.csv").is_file()]
     if not found:
         raise UsageError(f"{name} has no test yet; `fabctl indent run {name}` makes one")
@@ -96,11 +90,20 @@ def _ratios(
 ) -> list[dict[str, Any]]:
     found = []
     for figure in COMPARED:
+        if not a[figure] or not b[figure]:
+            continue
         if min(len(a[figure]), len(b[figure])) < 2:
+            found.append({"figure": figure, "above": above, "below": below, **asdict(_bare(a[figure], b[figure]))})
             continue
         for ratio in (fieller(a[figure], b[figure]), bca(a[figure], b[figure], np.random.default_rng(1))):
             found.append({"figure": figure, "above": above, "below": below, **asdict(ratio)})
     return found
+
+
+def _bare(above: Sequence[float], below: Sequence[float]) -> Ratio:
+    """Return a ratio without an interval, and why it has none."""
+    reason = f"{len(above)} and {len(below)} specimens; an interval needs at least two of each"
+    return Ratio(float(np.mean(above) / np.mean(below)), None, None, 0.95, "means", reason)
 
 
 def _curves(run: RunFolder) -> list[Numbered]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,15 @@ from fabctl.indent.analysis import summarise_run
 from fabctl.indent.calibration import Calibration, load_calibration
 from fabctl.indent.method import Action, Predicted, actions, check, read_predicted, time_s
 from fabctl.indent.recorder import Recorder
-from fabctl.indent.run import Ending, Runner, Wish, resumed
+from fabctl.indent.resume import against_resuming, curves_done, points_without_contact, resumed
+from fabctl.indent.run import Ending, Runner
+from fabctl.indent.sampling import Wish
 from fabctl.priority import before_other_work
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Specimen, Workspace
+
+CONDITIONS = ("thickness_mm", "batch", "rest_h")
+DRIFT_TOLD_FRAC = 0.01  # a drift of so much of the stiffness is told
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,7 @@ class IndentPlan:
     sample_hz: float
     findings: tuple[Finding, ...]
     resumes: str | None = None
+    conditions: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def time_s(self) -> float:
@@ -67,7 +74,12 @@ class Steering:
 
 
 def plan_test(
-    lab: Workspace, specimen: Specimen, method: str, bench: BenchConfig, resume: RunFolder | None = None
+    lab: Workspace,
+    specimen: Specimen,
+    method: str,
+    bench: BenchConfig,
+    resume: RunFolder | None = None,
+    facts: Mapping[str, Any] | None = None,
 ) -> IndentPlan:
     """Return what would be done, with everything that speaks against it; touches no device."""
     refuse_without(bench, "rig")
@@ -76,14 +88,16 @@ def plan_test(
     steps = actions(read)
     findings: list[Finding] = []
     if resume is not None:
-        findings += _against_resuming(resume, specimen, read, steps)
-        steps = resumed(steps, curves_done(resume))
+        findings += against_resuming(resume, specimen.name, read)
+        steps = resumed(steps, curves_done(resume), points_without_contact(resume))
         if not steps:
             findings.append(Finding("METHOD-DONE", "every curve of that run is done", where=resume.run_id))
     response = specimen.design / "response.csv"
     predicted = read_predicted(response) if response.is_file() else None
     calibration = load_calibration(lab.root, bench.name)
     findings += check(steps, read, bench.rig, predicted, "move_stage" in registers.commands)
+    found = conditions(specimen.record(), facts or {})
+    findings += unrecorded(found)
     findings += calibration.findings() if calibration is not None else _uncalibrated(bench.name)
     return IndentPlan(
         specimen,
@@ -98,6 +112,7 @@ def plan_test(
         read.sample_hz or bench.rig.sample_hz,
         tuple(findings),
         resume.run_id if resume is not None else None,
+        found,
     )
 
 
@@ -114,7 +129,6 @@ def run_test(
     bench: Bench,
     emit: Emit = silent,
     steering: Steering | None = None,
-    facts: Mapping[str, Any] | None = None,
     clock: Clock | None = None,
 ) -> RunFolder:
     """Carry the plan out and return its run, closed; a run that went wrong is closed as such, and the error raised."""
@@ -123,7 +137,7 @@ def run_test(
     with contextlib.closing(open_indenter(bench.url("rig"), plan.registers)) as rig:
         identity = rig.identify()
         _refuse_rig(plan, identity)
-        config = _config(plan, identity, {**rig.environment(), **(facts or {})})
+        config = _config(plan, identity, rig.environment(), bench.config.is_simulated)
         inputs = [plan.method_path, plan.map_path]
         inputs += [p for p in (plan.specimen.design / "response.csv",) if p.is_file()]
         run = start_run(lab.runs, "indent", specimen=plan.specimen.name, inputs=inputs, config=config)
@@ -151,7 +165,7 @@ def run_test(
             raise
     body = result_of(run, plan, ending)
     run.write_result(body)
-    if body["curves"] and all(curve["contact_mm"] is None for curve in body["curves"]):
+    if (body["curves"] or ending.no_contact) and all(curve["contact_mm"] is None for curve in body["curves"]):
         reason = "no curve has a contact: was a specimen in place, and the indenter free when it was tared?"
         run.finish("failed", reason)
         raise RefusedError(f"{run.run_id}: nothing was measured", [Finding("INDENT-NO-CONTACT", reason)])
@@ -162,11 +176,14 @@ def run_test(
 def result_of(run: RunFolder, plan: IndentPlan, ending: Ending) -> dict[str, Any]:
     """Return the run's figures, with how the sampling went and every warning that holds for them."""
     body = summarise_run(run)
+    places = {action.point: action.at_mm for action in plan.actions if action.at_mm is not None}
+    without = [{"point": n, "at_mm": places.get(n), "reason": why} for n, why in ending.no_contact.items()]
     body |= {
         "rows_count": ending.rows_count,
         "lost_replies_count": ending.lost_count,
         "tares_N": ending.tares_N,
-        "findings": [f.as_dict() for f in plan.findings],
+        "points_without_contact": without,
+        "findings": [f.as_dict() for f in (*plan.findings, *_drifting(body["curves"]), *_untouched(without))],
         "predicted_secant_N_mm": None,
     }
     if plan.predicted is not None and plan.predicted.depth_mm[-1] >= plan.method.secant_mm:
@@ -174,33 +191,48 @@ def result_of(run: RunFolder, plan: IndentPlan, ending: Ending) -> dict[str, Any
     return body
 
 
-def curves_done(run: RunFolder) -> list[tuple[int, int]]:
-    """Return (point, curve) of every curve that a run finished, from its events."""
-    import json
+def conditions(record: Mapping[str, Any], facts: Mapping[str, Any], now: datetime | None = None) -> dict[str, Any]:
+    """Return what is known of the specimen as it is tested: its record, what the operator says, and how long it rested.
 
-    found = []
-    path = run.path / "events.jsonl"
-    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
-        with contextlib.suppress(ValueError, KeyError):  # a last line may be cut short
-            event = json.loads(line)
-            if event["kind"] == "curve":
-                found.append((int(event["data"]["point"]), int(event["data"]["curve"])))
-    return found
+    The rest since its deployment follows from `deployed_utc` where nobody gives `rest_h`.
+    """
+    known = {key: record[key] for key in (*CONDITIONS, "deployed_utc") if record.get(key) is not None}
+    known |= {key: value for key, value in facts.items() if value is not None}
+    with contextlib.suppress(KeyError, ValueError, TypeError):
+        since = datetime.fromisoformat(str(known["deployed_utc"])).astimezone(UTC)
+        known.setdefault("rest_h", round(((now or datetime.now(UTC)) - since).total_seconds() / 3600, 2))
+    return known
 
 
-def _against_resuming(
-    run: RunFolder, specimen: Specimen, method: MethodConfig, steps: tuple[Action, ...]
-) -> list[Finding]:
-    manifest = run.manifest()
-    found = []
-    if manifest.get("kind") != "indent" or manifest.get("specimen") != specimen.name:
-        found.append(Finding("RESUME-OTHER", f"{run.run_id} is not a test of {specimen.name}"))
-    if manifest.get("config", {}).get("method") != method.model_dump(mode="json"):
-        found.append(Finding("RESUME-METHOD", "the method has changed since", hint="run it from the beginning"))
-    outcome = run.outcome()
-    if outcome is not None and outcome["status"] == "done":
-        found.append(Finding("RESUME-DONE", f"{run.run_id} came to its end"))
-    return found
+def unrecorded(known: Mapping[str, Any]) -> list[Finding]:
+    """Say which conditions of a test nobody has written down: rubber depends on them."""
+    lacking = [name for name in CONDITIONS if name not in known]
+    if not lacking:
+        return []
+    hint = "`fabctl specimen note S-… thickness_mm=2.31 batch=B7`, or --thickness-mm, --batch and --rest-h"
+    return [Finding("INDENT-CONDITIONS", f"not recorded: {', '.join(lacking)}", "warning", hint=hint)]
+
+
+def _drifting(curves: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
+    """Say which curves began while the force was drifting."""
+    worst = max(curves, key=lambda curve: abs(curve.get("drift_N_mm") or 0.0), default=None)
+    drift_N_mm = (worst or {}).get("drift_N_mm") or 0.0
+    if worst is not None and abs(drift_N_mm) > DRIFT_TOLD_FRAC * abs(worst.get("stiffness_secant_N_mm") or 0.0):
+        count = sum(bool(curve.get("drift_N_mm")) for curve in curves)
+        yield Finding(
+            "INDENT-DRIFT",
+            f"in {count} of {len(curves)} curves the force drifts before contact, by up to {1000 * drift_N_mm:.2g} "
+            "mN/mm; the contact is found beside it, forces under load may hold it",
+            "warning",
+            hint="let the load cell warm up, look for a cable that is dragged along, go faster",
+        )
+
+
+def _untouched(without: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
+    """Say at which grid points nothing was met."""
+    if without:
+        places = ", ".join(f"{one['point']} at ({one['at_mm'][0]:g}, {one['at_mm'][1]:g}) mm" for one in without)
+        yield Finding("INDENT-POINT-NO-CONTACT", f"no contact at point {places}: nothing measured there", "warning")
 
 
 def _uncalibrated(bench: str) -> list[Finding]:
@@ -254,17 +286,16 @@ def _refuse_rig(plan: IndentPlan, identity: Identity) -> None:
         raise RefusedError(f"{identity.model} cannot run method {plan.method.name}", found)
 
 
-def _config(plan: IndentPlan, identity: Identity, facts: Mapping[str, Any]) -> dict[str, Any]:
+def _config(plan: IndentPlan, identity: Identity, air: Mapping[str, float], simulated: bool) -> dict[str, Any]:
     """Return what is frozen into the run: method, plan, rig, calibration, and the conditions."""
-    record = plan.specimen.record()
-    known = {key: record[key] for key in ("thickness_mm", "batch", "rest_h", "deployed_utc") if key in record}
     return {
         "method": plan.method.model_dump(mode="json"),
         "plan": [asdict(action) for action in plan.actions],
         "rig": {**asdict(identity), "map": plan.registers.name, "indenter_radius_mm": plan.rig.indenter_radius_mm},
+        "simulated": simulated,
         "sample_hz": plan.sample_hz,
         "calibration": plan.calibration.as_dict() if plan.calibration is not None else None,
-        "conditions": {**known, **facts},
+        "conditions": {**air, **plan.conditions},
         "resumes": plan.resumes,
         "findings": [finding.as_dict() for finding in plan.findings],
     }

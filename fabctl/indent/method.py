@@ -28,6 +28,7 @@ from fabctl.config.method import (
     Zero,
 )
 from fabctl.errors import UsageError
+from fabctl.files import text_of
 
 Kind = Literal["tare", "approach", "preload", "zero", "load", "hold", "unload", "wait", "travel"]
 
@@ -135,12 +136,12 @@ class Predicted:
 def read_predicted(path: Path) -> Predicted:
     """Return a design's `response.csv`; raise `UsageError` where it is not one."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = text_of(path, "a design's response.csv").splitlines()
         rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
         depth = np.array([float(row["depth_mm"]) for row in rows])
         load = np.array([float(row["load_N"]) for row in rows])
-    except (OSError, KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{path}: not a response of a design: {fault}") from fault
+    except (KeyError, TypeError, ValueError) as fault:
+        raise UsageError(f"{path}: not a response of a design: no numbers under depth_mm and load_N") from fault
     if not lines or not lines[0].startswith("# fabctl response 1") or len(depth) < 2:
         raise UsageError(f"{path}: not a response of version 1")
     facts = dict(part.strip().split("=", 1) for part in lines[0].split(";")[1:] if "=" in part)
@@ -150,22 +151,28 @@ def read_predicted(path: Path) -> Predicted:
 
 def time_s(plan: Sequence[Action], travel_speed_mm_s: float, approach_mm: float = 10.0) -> float:
     """Return about how long the plan takes; waiting for the operator counts nothing."""
-    total, depth_mm, clearance_mm = 0.0, 0.0, 1.0
+    return sum(times_s(plan, travel_speed_mm_s, approach_mm))
+
+
+def times_s(plan: Sequence[Action], travel_speed_mm_s: float, approach_mm: float = 10.0) -> list[float]:
+    """Return about how long each action takes."""
+    found, depth_mm, clearance_mm = [], 0.0, 1.0
     for action in plan:
-        total += action.time_s + 0.1
+        own = action.time_s + 0.1
         if action.kind == "approach":
             clearance_mm = action.clearance_mm
-            total += approach_mm / action.speed_mm_s + clearance_mm / action.speed_mm_s
+            own += approach_mm / action.speed_mm_s + clearance_mm / action.speed_mm_s
             depth_mm = -clearance_mm
         elif action.kind in ("load", "unload", "preload"):
             goal = (
                 action.depth_mm if action.depth_mm is not None else (-clearance_mm if action.kind == "unload" else 2.0)
             )
-            total += abs(goal - depth_mm) / action.speed_mm_s
+            own += abs(goal - depth_mm) / action.speed_mm_s
             depth_mm = goal
         elif action.kind == "travel":
-            total += 2 * approach_mm / travel_speed_mm_s + 15 / action.speed_mm_s
-    return total
+            own += 2 * approach_mm / travel_speed_mm_s + 15 / action.speed_mm_s
+        found.append(own)
+    return found
 
 
 def check(
@@ -250,7 +257,7 @@ def _against(predicted: Predicted, deepest_mm: float, method: MethodConfig, rig:
 
 def _order(plan: Sequence[Action]) -> Iterator[Finding]:
     """Say where a step needs another before it."""
-    tared = found_contact = False
+    tared = found_contact = pressed = touching = False
     for k, action in enumerate(plan):
         where = f"step {k + 1} ({action.kind})"
         if action.kind == "travel":
@@ -265,3 +272,20 @@ def _order(plan: Sequence[Action]) -> Iterator[Finding]:
                 )
         elif action.kind in ("load", "preload", "zero", "unload") and not found_contact:
             yield Finding("METHOD-APPROACH", "no contact is known here", where=where, hint="add {step: approach}")
+        if action.kind == "tare" and touching:
+            text = "a tare while the specimen is pressed would take its force for zero"
+            yield Finding("METHOD-TARE-PRESSED", text, where=where, hint="unload before it")
+        touching = _touches(action, touching)
+        if action.kind == "load" and pressed:
+            text = "this curve begins under a preload: without a zero after it nothing can be counted from contact"
+            yield Finding("METHOD-PRELOAD", text, "warning", where=where, hint="add {step: zero} after the preload")
+        pressed = action.kind == "preload" or (pressed and action.kind in ("hold", "wait", "tare"))
+
+
+def _touches(action: Action, before: bool) -> bool:
+    """Tell whether the indenter stands in contact after an action; `before` is how it stood."""
+    if action.kind in ("load", "preload"):
+        return True
+    if action.kind == "unload":
+        return action.depth_mm is not None or action.force_N is not None
+    return before and action.kind not in ("approach", "travel")

@@ -8,6 +8,7 @@ from pathlib import Path
 from fabctl.indent.analysis import Numbered
 
 COLOURS = ("#0b6e99", "#c8502d", "#5b7f2b", "#7a4fa3", "#8a6d1f", "#444c55")
+DASHES = (0, (5, 4))  # wide enough to be seen as such where several curves lie on each other
 
 
 def draw_curves(groups: Mapping[str, Sequence[Numbered]], path: Path) -> bool:
@@ -22,8 +23,9 @@ def draw_curves(groups: Mapping[str, Sequence[Numbered]], path: Path) -> bool:
     for colour, (name, found) in zip(COLOURS * len(drawn), drawn.items(), strict=False):
         for k, n in enumerate(found):
             result = n.result
-            axes.plot(result.depth_mm, result.load_N, color=colour, lw=1.1, label=name if k == 0 else None)
-            axes.plot(result.unload_depth_mm, result.unload_N, color=colour, lw=0.9, ls="--", alpha=0.8)
+            label = f"{name} ({len(found)} curve{'s' * (len(found) > 1)})" if k == 0 else None
+            axes.plot(result.depth_mm, result.load_N, color=colour, lw=1.2, label=label)
+            axes.plot(result.unload_depth_mm, result.unload_N, color=colour, lw=0.8, ls=DASHES, alpha=0.7)
             if result.peak_depth_mm is not None and result.peak_N is not None:
                 axes.plot(result.peak_depth_mm, result.peak_N, "v", color=colour, ms=5)
     axes.set_xlabel("displacement [mm]")

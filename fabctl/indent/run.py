@@ -9,37 +9,26 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
 
 import numpy as np
 
 from design.findings import Finding
 from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.rig.indenter import LOST, Indenter, Limits, RigFaulted, ended
-from drivers.rig.samples import Restarted, Sample
+from drivers.errors import DeviceError
+from drivers.rig.indenter import Indenter, Limits, ended
+from drivers.rig.samples import Sample
 from fabctl.config.method import MethodConfig
-from fabctl.errors import FabctlError, RefusedError, Stopped
+from fabctl.errors import FabctlError, RefusedError
 from fabctl.events import Emit, Event, silent
 from fabctl.indent.contact import first_touch
-from fabctl.indent.method import Action, time_s
-from fabctl.indent.recorder import Row
+from fabctl.indent.method import Action, times_s
+from fabctl.indent.sampling import Keeper, Sampler, TimeLeft, Wish
 
-Wish = Literal["go", "pause", "stop"]
-SHOWN_HZ = 12.0
 HOMING_MM_S = 8.0
 STANDING_MM = 1.0  # the safe heights of two methods differ by less; a pressed specimen is farther down
 HARMLESS = ("unhomed", "restarted")  # what a controller says after it was switched on
 FREE_S, FREE_SIGMA, FREE_FRAC = 0.25, 4.0, 0.1
 MORE_ROOM_COUNT = 6
-
-
-class Keeper(Protocol):
-    """What takes the rows; `Recorder` makes them durable."""
-
-    def take(self, row: Row) -> None:
-        """Take one row."""
-        ...
 
 
 class NoContact(FabctlError):
@@ -85,6 +74,7 @@ class Ending:
     contacts_mm: dict[int, float] = field(default_factory=dict)
     tares_N: list[float] = field(default_factory=list)
     curves_done: list[tuple[int, int]] = field(default_factory=list)
+    no_contact: dict[int, str] = field(default_factory=dict)  # grid points where nothing was met, and why
 
 
 class Runner:
@@ -102,21 +92,12 @@ class Runner:
         wish: Callable[[], Wish] = lambda: "go",
         go_on: Callable[[str], bool] = lambda _message: True,
     ) -> None:
-        self.rig, self.method, self.plan, self.recorder = rig, method, plan, recorder
+        self.rig, self.method, self.plan = rig, method, plan
         self.clock, self.emit, self.wish, self.go_on = clock, emit, wish, go_on
-        self.slot_s = 1.0 / sample_hz
         self.ending = Ending()
-        self._action = Action("travel")
-        self._tare_N = 0.0
-        self._zero_mm: float | None = None
+        left = TimeLeft(times_s(plan, method.travel_speed_mm_s), clock.now_s())
+        self.sampler = Sampler(rig, recorder, clock, sample_hz, method.limits.watchdog_s, left, emit, wish)
         self._clear_mm = 0.0
-        self._trace: list[tuple[float, float]] = []
-        self._next_s = clock.now_s()
-        self._last_good_s = clock.now_s()
-        self._shown_s = 0.0
-        self._began_s = clock.now_s()
-        self._needed_s = max(1.0, time_s(plan, method.travel_speed_mm_s))
-        rig.hear = self._heard
 
     # --- the whole
 
@@ -124,11 +105,15 @@ class Runner:
         """Do it all; raise what went wrong, with the stage stopped and disarmed."""
         try:
             self._prepare()
-            for action in self.plan:
-                self._action = action
-                self.emit(Event("state", _spoken(action)))
-                self._do(action)
-            self._action = Action("travel")
+            for k, action in enumerate(self.plan):
+                if action.point in self.ending.no_contact:
+                    continue
+                self.sampler.action = action
+                self.sampler.time_left.begin(k, self.clock.now_s())
+                self.emit(Event("state", spoken(action)))
+                self._do_or_pass_by(action)
+            self.sampler.action = Action("travel")
+            self.sampler.time_left.begin(len(self.plan), self.clock.now_s())
             self._drive(self.method.safe_height_mm, self.method.travel_speed_mm_s)
         finally:
             self._leave()
@@ -167,9 +152,25 @@ class Runner:
             self.emit(Event("warning", f"rig: {fault}"))
         if not stopped:
             self.emit(Event("warning", "rig: the stop was not confirmed; the controller's watchdog stops the stage"))
-        self.ending.lost_count = self.rig.lost_count
+        self.ending.lost_count, self.ending.rows_count = self.rig.lost_count, self.sampler.rows_count
 
     # --- one action
+
+    def _do_or_pass_by(self, action: Action) -> None:
+        """Do it; a grid point where nothing is met is noted, and the next one gone to by the safe height.
+
+        Safe because the approach ended free: the controller stands ready, with nothing latched, and every grid point
+        begins by rising to the safe height and with a tare of its own. Outside a grid nothing is left to measure.
+        """
+        try:
+            self._do(action)
+        except NoContact as fault:
+            now = self.sampler.fresh()
+            if not action.point or now.faults or now.force_N - self.sampler.tare_N >= fault.trigger_N:
+                raise
+            self.ending.no_contact[action.point] = str(fault)
+            self.emit(Event("no_contact", f"point {action.point}: {fault}", data={"point": action.point}))
+            self.emit(Event("warning", f"point {action.point}: no contact, noted; going on to the next one"))
 
     def _do(self, action: Action) -> None:
         if action.kind == "tare":
@@ -178,9 +179,9 @@ class Runner:
             self._approach(action)
         elif action.kind == "preload":
             self._drive_to(action)
-            self._rest(action.time_s)
+            self.sampler.for_a_time(action.time_s)
         elif action.kind == "zero":
-            self._zero_mm = self._fresh().position_mm
+            self.sampler.zero_mm = self.sampler.fresh().position_mm
         elif action.kind == "load":
             self._drive_to(action)
         elif action.kind == "unload":
@@ -188,7 +189,7 @@ class Runner:
             self.ending.curves_done.append((action.point, action.curve))
             self.emit(Event("curve", f"curve {action.curve} done", data={"point": action.point, "curve": action.curve}))
         elif action.kind == "hold":
-            self._rest(action.time_s)
+            self.sampler.for_a_time(action.time_s)
         elif action.kind == "wait":
             self._wait(action.message)
         else:
@@ -196,38 +197,35 @@ class Runner:
 
     def _tare(self, duration_s: float) -> None:
         """Average the gross force; the limits go on acting on the gross force."""
-        forces: list[float] = []
-        until_s = self.clock.now_s() + duration_s
-        while self.clock.now_s() < until_s:
-            forces.append(self._fresh().force_N)
-        found_N = statistics.fmean(forces)
+        found_N = statistics.fmean(self.sampler.for_a_time(duration_s))
         if abs(found_N) > 0.5 * self.method.limits.force_N:
             raise ForceOffZero(
                 f"tare: the free load cell shows {found_N:.3f} N, more than half of the limit "
                 f"{self.method.limits.force_N:g} N; is the indenter free, and the cell in order?"
             )
-        self._tare_N = found_N
+        self.sampler.tare_N = found_N
         self.ending.tares_N.append(found_N)
 
     def _approach(self, action: Action) -> None:
         trigger_N = action.force_N or 0.0
-        here_mm = self._fresh().position_mm
+        here_mm = self.sampler.fresh().position_mm
         end_mm = self.method.limits.travel_mm if action.travel_mm is None else here_mm + action.travel_mm
         end_mm = min(end_mm, self.method.limits.travel_mm)
-        self._trace.clear()
-        found = self._drive(end_mm, action.speed_mm_s, above_N=self._tare_N + trigger_N)
+        self.sampler.trace.clear()
+        self.sampler.zero_mm = None
+        found = self._drive(end_mm, action.speed_mm_s, above_N=self.sampler.tare_N + trigger_N)
         if found.reason == "limit_not_reached":
             raise NoContact(trigger_N, found.position_mm)
-        self._zero_mm = self._touched(found.position_mm)
-        self._clear_mm = max(0.0, self._zero_mm - action.clearance_mm)
-        self.ending.contacts_mm[action.point] = self._zero_mm
+        zero_mm = self._touched(found.position_mm)
+        self.sampler.zero_mm = self.ending.contacts_mm[action.point] = zero_mm
+        self._clear_mm = max(0.0, zero_mm - action.clearance_mm)
         self._drive(self._clear_mm, action.speed_mm_s)
         self._make_free(action)
 
     def _touched(self, triggered_mm: float) -> float:
         """Return where contact began: a soft specimen is millimetres deep before the trigger's force is there."""
-        position = np.array([place for place, _ in self._trace])
-        force = np.array([force for _, force in self._trace])
+        position = np.array([place for place, _ in self.sampler.trace])
+        force = np.array([force for _, force in self.sampler.trace])
         forward = np.flatnonzero(np.diff(position, prepend=position[:1] - 1.0) > 0)
         # Nothing samples while this is computed, so nothing feeds the watchdog: the stage stands disarmed meanwhile.
         self.rig.disarm()
@@ -238,10 +236,7 @@ class Runner:
     def _make_free(self, action: Action) -> None:
         """Rise until the force is that of the tare: every curve must begin free."""
         for _ in range(MORE_ROOM_COUNT):
-            until_s = self.clock.now_s() + FREE_S
-            forces = []
-            while self.clock.now_s() < until_s:
-                forces.append(self._fresh().force_N - self._tare_N)
+            forces = [force_N - self.sampler.tare_N for force_N in self.sampler.for_a_time(FREE_S)]
             if statistics.fmean(forces) < FREE_SIGMA * statistics.pstdev(forces) / len(forces) ** 0.5 + FREE_FRAC * (
                 action.force_N or 0.0
             ):
@@ -255,25 +250,19 @@ class Runner:
 
     def _drive_to(self, action: Action) -> None:
         """Go to the depth or force an action names."""
-        assert self._zero_mm is not None  # the check of the plan asks for an approach first
+        assert self.sampler.zero_mm is not None  # the check of the plan asks for an approach first
         if action.depth_mm is not None:
-            self._drive(self._zero_mm + action.depth_mm, action.speed_mm_s)
+            self._drive(self.sampler.zero_mm + action.depth_mm, action.speed_mm_s)
         elif action.force_N is None:
             self._drive(self._clear_mm, action.speed_mm_s)
         elif action.kind == "unload":
-            self._drive(self._clear_mm, action.speed_mm_s, below_N=self._tare_N + action.force_N)
+            self._drive(self._clear_mm, action.speed_mm_s, below_N=self.sampler.tare_N + action.force_N)
         else:
-            self._drive(self.method.limits.travel_mm, action.speed_mm_s, above_N=self._tare_N + action.force_N)
-
-    def _rest(self, duration_s: float) -> None:
-        until_s = self.clock.now_s() + duration_s
-        while self.clock.now_s() < until_s:
-            self._fresh()
+            self._drive(self.method.limits.travel_mm, action.speed_mm_s, above_N=self.sampler.tare_N + action.force_N)
 
     def _wait(self, message: str) -> None:
         self.emit(Event("wait", message))
-        while not self.go_on(message):
-            self._fresh()
+        self.sampler.while_held(lambda: not self.go_on(message))
 
     def _travel(self, action: Action) -> None:
         assert action.at_mm is not None
@@ -305,7 +294,7 @@ class Runner:
     def _finish(self, number: int) -> Sample | None:
         """Sample until a command is over and the stage stands; None where the operator paused it."""
         while True:
-            found = self._fresh()
+            found = self.sampler.fresh()
             if ended(found, number) and found.state != "moving":
                 return found
             if self.wish() == "pause":
@@ -315,83 +304,12 @@ class Runner:
     def _pause(self) -> None:
         self.rig.stop()
         self.emit(Event("state", "paused; the stage stands"))
-        while self.wish() == "pause":
-            self._fresh()
+        self.sampler.while_held(lambda: self.wish() == "pause")
         self.emit(Event("state", "going on"))
 
-    def _fresh(self) -> Sample:
-        """Return the sample of the next slot; a lost reply is asked for again until the watchdog would have bitten."""
-        self._await_slot()
-        while True:
-            if self.wish() == "stop":
-                raise Stopped("stopped by the operator; the stage stands where it is")
-            try:
-                found = self.rig.sample()
-            except Restarted:
-                raise
-            except LOST as fault:
-                silent_s = self.clock.now_s() - self._last_good_s
-                if silent_s > self.method.limits.watchdog_s:
-                    raise DeviceTimeout(self.rig.bus.url, "a believable status", silent_s, str(fault)) from fault
-                continue
-            if found.state == "faulted":
-                raise RigFaulted(found.faults, found.position_mm, found.force_N)
-            if found.state == "disarmed":
-                raise DeviceRefused("rig", "sampling", "the controller has disarmed itself", "another host?")
-            return found
 
-    def _await_slot(self) -> None:
-        """Wait for the next slot of a fixed grid; slots that are past are left out, not caught up with."""
-        now_s = self.clock.now_s()
-        late = int((now_s - self._next_s) / self.slot_s)
-        if late > 0:
-            self._next_s += late * self.slot_s
-        if self._next_s > now_s:
-            self.clock.sleep(self._next_s - now_s)
-        self._next_s += self.slot_s
-
-    def _heard(self, sample: Sample) -> None:
-        """Keep every believed sample, also those asked for to confirm a command."""
-        self._last_good_s = now_s = self.clock.now_s()
-        action = self._action
-        self.recorder.take(
-            Row(
-                time_s=sample.time_s,
-                sequence=sample.sequence,
-                position_mm=sample.position_mm,
-                force_gross_N=sample.force_N,
-                force_N=sample.force_N - self._tare_N,
-                step=action.kind,
-                point=action.point,
-                curve=action.curve,
-                state=sample.state,
-                faults="|".join(sample.faults),
-            )
-        )
-        self.ending.rows_count += 1
-        if action.kind == "approach":
-            self._trace.append((sample.position_mm, sample.force_N - self._tare_N))
-        if now_s - self._shown_s >= 1 / SHOWN_HZ:
-            self._shown_s = now_s
-            self._show(sample, now_s)
-
-    def _show(self, sample: Sample, now_s: float) -> None:
-        spent_s = now_s - self._began_s
-        depth_mm = None if self._zero_mm is None else sample.position_mm - self._zero_mm
-        force_N = sample.force_N - self._tare_N
-        words = f"{self._action.kind:8} {force_N:8.3f} N " + (f"{depth_mm:8.3f} mm" if depth_mm is not None else "")
-        left_s = max(0.0, self._needed_s - spent_s)
-        self.emit(
-            Event(
-                "progress",
-                f"{words}  {left_s:4.0f} s left",
-                done_frac=min(0.999, spent_s / self._needed_s),
-                data={"force_N": force_N, "depth_mm": depth_mm, "step": self._action.kind, "curve": self._action.curve},
-            )
-        )
-
-
-def _spoken(action: Action) -> str:
+def spoken(action: Action) -> str:
+    """Return what an action does, in words."""
     goal = ""
     if action.depth_mm is not None:
         goal = f" to {action.depth_mm:g} mm"
@@ -402,22 +320,5 @@ def _spoken(action: Action) -> str:
     which = f" (curve {action.curve}{', conditioning' if action.condition else ''})" if action.curve else ""
     rate = f" at {action.speed_mm_s:g} mm/s" if action.speed_mm_s else ""
     span = f" for {action.time_s:g} s" if action.time_s else ""
-    return f"{action.kind}{goal}{rate}{span}{which}"
-
-
-def resumed(plan: Sequence[Action], done: Sequence[tuple[int, int]]) -> tuple[Action, ...]:
-    """Return what is left of a plan after the curves `done`, each (point, curve).
-
-    Whole curves only: one that was broken off is run again. Every point that is left begins with its tare and approach,
-    so nothing is gone on with under an old zero.
-    """
-    finished = set(done)
-    curves = {(a.point, a.curve) for a in plan if a.curve}
-    left = {point for point, curve in curves - finished}
-    kept = [a for a in plan if a.point in left and not (a.curve and (a.point, a.curve) in finished)]
-    return tuple(_without_idle_rests(kept))
-
-
-def _without_idle_rests(plan: Sequence[Action]) -> list[Action]:
-    """Drop rests that belonged to curves which are left out."""
-    return [a for k, a in enumerate(plan) if not (a.kind == "hold" and not a.curve and plan[k - 1].kind != "unload")]
+    asked = f": {action.message}" if action.message else ""
+    return f"{action.kind}{goal}{rate}{span}{which}{asked}"

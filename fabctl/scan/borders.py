@@ -2,7 +2,7 @@
 
 A hole in a surface of revolution hardly shows in a distance, yet it alone tells how the surface is turned. Points where
 there is no target speak against a pose, and cannot be explained by what was not seen. That the cloud ends along a loop
-of the border only speaks for a pose: a gap in a scan can have any shape, so it never decides alone.
+of the border coarsely only speaks for a pose: a gap in a scan can have any shape. `edges` looks at it closely.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from fabctl.scan.edges import EdgeFinder, Edges
 from fabctl.scan.similarity import Similarity, rotation_of
 from fabctl.scan.target import Target
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 REACH_FRAC = 0.02  # of the diagonal; how far inside and outside the border points are asked for
 LOOP_SHARE = 0.2  # likewise of a loop's own width, for small holes
@@ -24,8 +26,8 @@ PLACE_RATIO, RADIUS_RATIO = 1.2, 0.8  # of the reach: where the balls lie and ho
 LEAST_POINTS = 8.0  # a ball should usually hold, or the cloud is too thin to say where it ends
 SEEN_RATIO, EMPTY_RATIO = 0.4, 0.15  # of the usual number of points in a ball
 REFUTED, FREE, BORNE_OUT = 0.2, 0.05, 0.5  # shares of a loop
-SPINS = 120
-ANGLES_KEPT = 3
+SPINS = 240
+ANGLES_KEPT, APART_RAD = 4, 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,34 +83,70 @@ def borne_out(cloud: cKDTree, pose: Similarity, target: Target) -> Borne | None:
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A pose turned all round the axis of a motion that the surface hardly holds, and what the border says of each."""
+    """A pose turned all round an axis about which the surface hardly holds it, and what the border says of each turn.
+
+    Only the turns that the cloud does not contradict are held.
+    """
 
     poses: tuple[Similarity, ...]
-    said: tuple[Borne | None, ...]
+    angles_rad: Floats  # of the poses, -pi to pi
+    merit: Floats  # of the poses; more is better
+    edges: tuple[tuple[Edges, Mask], ...]  # of the poses, with the stretches of border that tell it from the first
 
     def likeliest(self) -> list[Similarity]:
-        """Return the turns where the border is borne out best."""
-        n = len(self.poses)
-        merit = [-np.inf if s is None else s.total() for s in self.said]
-        top = [k for k in range(n) if merit[k] > merit[k - 1] and merit[k] >= merit[(k + 1) % n]]
-        return [self.poses[k] for k in sorted(top, key=lambda k: -merit[k])[:ANGLES_KEPT]]
+        """Return the turns where the border is borne out best, well apart, also from the first pose."""
+        picked: list[int] = []
+        for k in np.argsort(-self.merit, kind="stable"):
+            off = np.abs([_angle(self.angles_rad[k] - a) for a in (0.0, *self.angles_rad[picked])])
+            if off.min() > APART_RAD and len(picked) < ANGLES_KEPT:
+                picked.append(int(k))
+        return [self.poses[k] for k in picked]
 
     def open_elsewhere(self) -> bool:
         """Return whether a turn apart from the first pose's own stretch is not contradicted either."""
-        refuted = [s is not None and s.contradicted() for s in self.said]
-        if not any(refuted):
-            return bool(self.said)
-        first, last = refuted.index(True), len(refuted) - 1 - refuted[::-1].index(True)
-        return not all(refuted[first : last + 1])
+        if len(self.poses) == 0:
+            return False
+        sorted_rad = np.sort(np.concatenate([self.angles_rad, [0.0]]))
+        steps = np.diff(np.concatenate([sorted_rad, [sorted_rad[0] + 2 * np.pi]]))
+        return bool((steps > 2.5 * 2 * np.pi / SPINS).sum() > 1)
 
 
-def circle(cloud: cKDTree, pose: Similarity, motion: Floats, target: Target) -> Circle:
-    """Return the pose turned about the axis of the small `motion` (7,); empty where it hardly turns."""
-    turn, shift = motion[:3], motion[3:6]
-    size = float(np.linalg.norm(turn))
-    if size < 0.5 * float(np.linalg.norm(shift)):
-        return Circle((), ())
-    centre = target.centre_mm + np.cross(turn, shift) / size**2 * target.diagonal_mm
-    turns = [rotation_of(angle * turn / size) for angle in 2 * np.pi * np.arange(SPINS) / SPINS]
-    made = tuple(Similarity(r, centre - r @ centre).after(pose) for r in turns)
-    return Circle(made, tuple(borne_out(cloud, p, target) for p in made))
+def _angle(angle: float) -> float:
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def rim_axis(target: Target) -> tuple[Floats, Floats] | None:
+    """Return point and direction of the axis of the border's longest loop, where there is more than that loop."""
+    border = target.border
+    if border is None or border.loop.max() == 0:
+        return None
+    longest = int(np.argmax(np.bincount(border.loop, border.length_mm)))
+    mine = border.loop == longest
+    points, length = border.points_mm[mine], border.length_mm[mine, None]
+    middle = np.asarray((length * points).sum(axis=0) / length.sum())
+    return middle, np.linalg.svd(np.sqrt(length) * (points - middle), full_matrices=False)[2][2]
+
+
+def turn_motion(axis: tuple[Floats, Floats], target: Target) -> Floats:
+    """Return the small motion (7,) that turns about the axis; see `refine.Rows`."""
+    arm = (axis[0] - target.centre_mm) / target.diagonal_mm
+    return np.concatenate([axis[1], np.cross(arm, axis[1]), [0.0]])
+
+
+def circle(cloud: cKDTree, finder: EdgeFinder, pose: Similarity, axis: tuple[Floats, Floats]) -> Circle:
+    """Return the pose turned about the axis, in turns that the cloud, as read, does not contradict."""
+    kept, angles, merit, found = [], [], [], []
+    for k in range(SPINS):
+        turn = rotation_of(2 * np.pi * k / SPINS * axis[1])
+        spun = Similarity(turn, axis[0] - turn @ axis[0])
+        image = spun.after(pose)
+        said = borne_out(cloud, image, finder.target)
+        if said is None or said.contradicted():
+            continue
+        which = finder.telling(spun)
+        edges = finder.at(image)
+        kept.append(image)
+        found.append((edges, which))
+        angles.append(_angle(2 * np.pi * k / SPINS))
+        merit.append(said.total() + edges.exact_frac(which) - 2 * edges.crossed_frac(which))
+    return Circle(tuple(kept), np.array(angles), np.array(merit), tuple(found))

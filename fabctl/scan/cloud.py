@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.findings import Finding
-from fabctl.errors import RefusedError, UsageError
+from fabctl.errors import RefusedError, UnreadableInput, UsageError
+from fabctl.files import text_of
 from fabctl.scan.foreign import open3d
 from fabctl.scan.stream import Piece, draw, las_pieces, ply_header, ply_pieces, text_pieces
 
@@ -57,16 +58,22 @@ def read_cloud(path: Path, seed: int = 0, most: int = MOST_POINTS) -> Cloud:
     if kind not in FORMATS:
         raise UsageError(f"{path}: not a cloud this program reads (known: {', '.join(FORMATS)})")
     if path.stat().st_size == 0:
-        raise RefusedError(f"{path}: cannot be compared", [Finding("SCAN-FILE", "the file is empty", where=str(path))])
+        raise UnreadableInput(
+            f"{path}: cannot be compared", [Finding("SCAN-FILE", "the file is empty", where=str(path))]
+        )
+    if kind == ".ply":
+        _must_be_ply(path)
     header = ply_header(path) if kind == ".ply" else None
     skipped: list[int] = []
+    said: list[Finding] = []
     if kind in (".las", ".laz"):
         found = _drawn(path, las_pieces(path), seed, most)
     elif kind in (".xyz", ".txt", ".csv"):
-        found = _drawn(path, text_pieces(path, skipped), seed, most)
-        if len(found.points) == 0 and not found.findings:
-            said = Finding("SCAN-TEXT", "no line holds three numbers", where=str(path), hint="one point a line: x y z")
-            raise RefusedError(f"{path}: cannot be compared", [said])
+        found = _drawn(path, text_pieces(path, skipped, said), seed, most)
+        found = replace(found, findings=(*said, *found.findings))
+        if len(found.points) == 0 and len(found.findings) == len(said):
+            none = Finding("SCAN-TEXT", "no line holds three numbers", where=str(path), hint="one point a line: x y z")
+            raise UnreadableInput(f"{path}: cannot be compared", [none])
         if sum(skipped) > 1:
             lines = Finding("SCAN-LINES", f"{sum(skipped)} lines hold no point", level="warning")
             found = replace(found, findings=(*found.findings, lines))
@@ -75,6 +82,14 @@ def read_cloud(path: Path, seed: int = 0, most: int = MOST_POINTS) -> Cloud:
     else:
         found = _thinned(_read_open3d(path, kind, seed), seed, most)
     return _checked(found)
+
+
+def _must_be_ply(path: Path) -> None:
+    """Raise `UnreadableInput` where the file does not begin as PLY does; Open3D answers with chatter of its own."""
+    with path.open("rb") as stream:
+        if stream.read(3) != b"ply":
+            said = Finding("SCAN-FILE", "not a PLY file, whatever its name says", where=str(path))
+            raise UnreadableInput(f"{path}: cannot be compared", [said])
 
 
 def _drawn(path: Path, pieces: Iterator[Piece], seed: int, most: int) -> Cloud:
@@ -120,7 +135,8 @@ def _checked(cloud: Cloud) -> Cloud:
     elif float(np.ptp(cloud.points, axis=0).max()) <= 0:
         findings.append(Finding("SCAN-POINT", "all points are the same"))
     if any(f.level == "error" for f in findings):
-        raise RefusedError(f"{cloud.source}: cannot be compared", findings)
+        kind = RefusedError if len(cloud.points) else UnreadableInput
+        raise kind(f"{cloud.source}: cannot be compared", findings)
     return cloud
 
 
@@ -145,9 +161,8 @@ def _obj_vertices(path: Path) -> Floats:
     try:
         return np.array([[float(x) for x in row] for row in rows], dtype=np.float64).reshape(-1, 3)
     except ValueError as fault:
-        raise RefusedError(
-            f"{path}: cannot be compared", [Finding("SCAN-TEXT", f"a vertex is not three numbers: {fault}")]
-        ) from fault
+        said = Finding("SCAN-TEXT", "a vertex is not three numbers", where=str(path))
+        raise UnreadableInput(f"{path}: cannot be compared", [said]) from fault
 
 
 def _sampled(mesh: Any, path: Path, seed: int) -> Cloud:
@@ -177,6 +192,8 @@ def read_painted(path: Path) -> tuple[Floats, NDArray[np.uint8] | None]:
     """Return points and colours of a PLY file, its vertices where it is a mesh; no colours where it has none."""
     if not path.is_file():
         raise UsageError(f"{path}: no such file")
+    if path.suffix.lower() == ".ply":
+        _must_be_ply(path)
     o3d = open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         read = o3d.io.read_point_cloud(str(path))
@@ -200,7 +217,7 @@ def read_labelled(path: Path) -> dict[str, Floats]:
         raise UsageError(f"{path}: no such file")
     found: dict[str, Floats] = {}
     bad: list[Finding] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(text_of(path, "labelled points: label,x,y,z").splitlines(), 1):
         words = [w.strip() for w in line.split(",")]
         if not line.strip() or line.startswith("#") or (number == 1 and words[1:4] == ["x", "y", "z"]):
             continue
@@ -213,7 +230,7 @@ def read_labelled(path: Path) -> dict[str, Floats]:
         else:
             found[label] = place
     if bad:
-        raise RefusedError(f"{path}: cannot be used", bad)
+        raise (RefusedError if found else UnreadableInput)(f"{path}: cannot be used", bad)
     return found
 
 

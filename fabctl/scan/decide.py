@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from fabctl.scan.borders import borne_out, circle
+from fabctl.scan.borders import borne_out, circle, rim_axis
+from fabctl.scan.edges import EdgeFinder, clinched
 from fabctl.scan.judge import Judged
 from fabctl.scan.paint import LUMA, Paint, chosen_by_paint, likeness
-from fabctl.scan.refine import Options, weak_motions
 from fabctl.scan.symmetry import Symmetries, spin_angle
 from fabctl.scan.target import Target
 
@@ -20,6 +20,7 @@ Floats = NDArray[np.float64]
 
 HELD_FRAC = 0.002  # of the diagonal; a motion that the surface does not hold to this is tried
 SPIN_STEPS, FINE_STEPS = 180, 21  # turns about an axis of revolution that colours are compared at
+ONE_POSE_FRAC = 0.02  # of the diagonal; poses farther apart differ, even where the border does not tell them
 APART_RAD = 0.2  # turns nearer to the best one than this are the same
 
 
@@ -56,20 +57,35 @@ def spun_to(judged: Judged, datums: Datums, symmetries: Symmetries) -> Judged:
     return replace(judged, fit=replace(judged.fit, pose=symmetries.spin(angle).after(judged.pose)))
 
 
-def decide_by_border(tree: cKDTree, candidates: list[Judged], target: Target, options: Options) -> Judged | None:
-    """Return the one candidate that the border does not contradict, if every other turn is contradicted.
+def decide_by_border(
+    finder: EdgeFinder, tree: cKDTree, candidates: list[Judged], symmetries: Symmetries
+) -> Judged | None:
+    """Return the one candidate that the border singles out, if it does; `tree` holds the part's points as read.
 
-    `tree` holds the part's points as read.
+    Either the cloud contradicts every other turn, or it ends along the border in one pose exactly and in no other
+    nearly as well. Poses that hardly move the border are one, and the one where the border fits best stands for them.
     """
-    said = [borne_out(tree, j.pose, target) for j in candidates]
-    left = [k for k, s in enumerate(said) if s is None or not s.contradicted()]
-    if len(left) != 1:
+    target = finder.target
+    edges = [finder.at(j.pose) for j in candidates]
+    between = [[finder.telling(b.pose.after(a.pose.inverse())) for b in candidates] for a in candidates]
+    tells = np.any(between, axis=(0, 1))
+    first = int(np.argmax([e.exact_frac(tells) - e.crossed_frac(tells) for e in edges]))
+    mine, telling = candidates[first], between[first]
+    apart = [symmetries.apart_frac(mine.pose, j.pose, target) for j in candidates]
+    if any(a > ONE_POSE_FRAC and not t.any() for a, t in zip(apart, telling, strict=True)):
         return None
-    mine, borne = candidates[left[0]], said[left[0]]
-    weak = weak_motions(mine.fit, target, options, HELD_FRAC)
-    others = [circle(tree, mine.pose, motion, target) for motion in weak]
-    doubt = any(c.open_elsewhere() for c in others)
-    return mine if borne is not None and borne.free() and not doubt else None
+    said = [borne_out(tree, j.pose, target) for j in candidates]
+    far = [k for k in range(len(candidates)) if telling[k].any()]
+    axis = rim_axis(target)
+    turns = None if axis is None else circle(tree, finder, mine.pose, axis)
+    only = all((s := said[k]) is not None and s.contradicted() for k in far)
+    own = said[first]
+    if far and only and own is not None and own.free() and (turns is None or not turns.open_elsewhere()):
+        return mine
+    others = [(edges[k], telling[k]) for k in far]
+    others += [] if turns is None else [e for e in turns.edges if e[1].any()]
+    enough = all(finder.long_enough(which) for _, which in others)
+    return mine if enough and clinched(edges[first], others) else None
 
 
 def decide_by_paint(

@@ -127,6 +127,7 @@ def compare(request: Request, emit: Emit = silent) -> Comparison:
     target = read_target(request.target)
     emit(Event("stage", f"reading {request.cloud}"))
     cloud = read_cloud(request.cloud, request.seed)
+    paint = _paint(request, cloud)
     emit(Event("stage", f"cleaning {len(cloud.points)} points"))
     cleaned = clean(cloud.points, request.seed)
     scale = known_scale(request, cloud, cleaned)
@@ -140,7 +141,7 @@ def compare(request: Request, emit: Emit = silent) -> Comparison:
         None if scale is None else scale.unit_mm,
         read_datums(request),
         cloud.colours,
-        None if cloud.colours is None else _paint(request),
+        paint,
         request.seed,
         emit,
     )
@@ -184,10 +185,11 @@ def known_scale(request: Request, cloud: Cloud, cleaned: Cleaned) -> Scale | Non
     return scale_from_board(marks_on_table(cloud.points, cloud.colours, cleaned), read_labelled(request.board))
 
 
-def _paint(request: Request) -> Paint | None:
+def _paint(request: Request, cloud: Cloud) -> Paint | None:
     """Return what the specimen looks like: as the file asked for says, or the target's own colours, if it has any."""
-    if request.colours is not None:
-        return read_paint(request.colours)
+    asked = None if request.colours is None else read_paint(request.colours)
+    if asked is not None or cloud.colours is None:
+        return asked
     if request.target.suffix.lower() != ".ply":
         return None
     points, colours = read_painted(request.target)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fabctl.errors import UsageError
+from fabctl.files import text_of
 from fabctl.scan.markers import Scale
 from fabctl.vision.boards import MarkSheet
 from fabctl.vision.scale import Bar, ScanScale, scale_by_bars
@@ -31,14 +32,9 @@ def scale_from_shots(model: Path, pictures: Path, sheet: MarkSheet) -> Scale:
 def read_bars(path: Path) -> list[Bar]:
     """Return the bars in a CSV file: two points in cloud units and their distance in mm; errors name the line."""
     bars = []
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            for number, row in enumerate(csv.reader(stream), start=1):
-                if not row or tuple(cell.strip() for cell in row) == BAR_HEADER:
-                    continue
-                bars.append(_bar(row, f"{path}:{number}"))
-    except (OSError, UnicodeDecodeError) as fault:
-        raise UsageError(f"{path}: cannot be read: {fault}") from fault
+    for number, row in enumerate(csv.reader(text_of(path, "scale bars").splitlines()), start=1):
+        if row and tuple(cell.strip() for cell in row) != BAR_HEADER:
+            bars.append(_bar(row, f"{path}:{number}"))
     if not bars:
         raise UsageError(f"{path}: no bars; a line is {','.join(BAR_HEADER)}")
     return bars
@@ -48,7 +44,7 @@ def _bar(row: list[str], where: str) -> Bar:
     try:
         values = [float(cell) for cell in row]
     except ValueError as fault:
-        raise UsageError(f"{where}: not a number: {fault}") from fault
+        raise UsageError(f"{where}: not numbers; a line is {','.join(BAR_HEADER)}") from fault
     if len(values) != len(BAR_HEADER) or not all(map(math.isfinite, values)):
         raise UsageError(f"{where}: {len(values)} values; a line is {','.join(BAR_HEADER)}")
     return Bar(np.array(values[:3]), np.array(values[3:6]), values[6])

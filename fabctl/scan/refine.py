@@ -133,8 +133,8 @@ def patch_rows(points: Floats, pose: Similarity, target: Target, patches: cKDTre
     gap = placed - found.points_mm
     residual = np.sum(gap * found.normals, axis=1) / size
     good = ~found.on_border & (np.abs(residual) < band_frac)
-    placed, normals, residual = placed[good], found.normals[good], residual[good]
-    _, patch = nearest(patches, found.points_mm[good])
+    feet, normals, residual = found.points_mm[good], found.normals[good], residual[good]
+    _, patch = nearest(patches, feet)
     middle = patch_medians(residual, patch, patches.n)
     off = residual - middle[patch]
     noise = max(1.4826 * float(np.median(np.abs(off))) if len(off) else 0.0, 1e-9)
@@ -142,7 +142,8 @@ def patch_rows(points: Floats, pose: Similarity, target: Target, patches: cKDTre
     total = np.bincount(patch, weight, minlength=patches.n)
     count = np.bincount(patch, minlength=patches.n)
     used = (count >= LEAST_IN_PATCH) & (total > 0.25 * count)
-    J = jacobian((placed - target.centre_mm) / size, normals)
+    # At the feet, not at the points: the points' noise would go with the residual's and shrink the scale.
+    J = jacobian((feet - target.centre_mm) / size, normals)
     mean = np.stack([np.bincount(patch, weight * J[:, k], minlength=patches.n) for k in range(7)], axis=1)
     mean_residual = np.bincount(patch, weight * residual, minlength=patches.n)
     share = np.full(patches.n, 1.0 / patches.n)
@@ -208,12 +209,7 @@ def weak_motions(fit: Fit, target: Target, options: Options, limit_frac: float) 
     The size of a motion is its rms displacement of the target. What is weak here is held by the rim alone, if at all.
     Patches share errors with their neighbours, so their information is taken three times less sure than it looks.
     """
-    arms = target.search.grid.points[:400]
-    moves = np.stack([np.concatenate([np.cross(np.eye(3)[k], a) for a in arms]) for k in range(3)], axis=1)
-    shifts = np.tile(np.eye(3), (len(arms), 1))
-    D = np.concatenate([moves, shifts, arms.reshape(-1, 1)], axis=1) / np.sqrt(len(arms))
-    sigma = max(fit.patch_sigma_frac, 3e-4)
-    H = (fit.patches.jacobian * fit.weight[:, None]).T @ fit.patches.jacobian / (3 * sigma) ** 2
+    D, H = _displacement(target), _information(fit)
     basis = np.eye(7)[:, [k for k in range(7) if k < 6 or options.free_scale]]
     if options.still is not None:
         kept = basis - np.outer(options.still, options.still @ basis)
@@ -223,6 +219,25 @@ def weak_motions(fit: Fit, target: Target, options: Options, limit_frac: float) 
     root = np.linalg.inv(np.linalg.cholesky(metric + 1e-12 * np.eye(len(metric)))).T
     values, vectors = np.linalg.eigh(root.T @ basis.T @ H @ basis @ root)
     return [np.asarray(basis @ root @ vectors[:, k]) for k in np.flatnonzero(values < 1 / limit_frac**2)]
+
+
+def is_weak(motion: Floats, fit: Fit, target: Target, limit_frac: float) -> bool:
+    """Return whether the surface does not hold the motion (7,) to `limit_frac` of the diagonal."""
+    moved = float(np.sum((_displacement(target) @ motion) ** 2))
+    return float(motion @ _information(fit) @ motion) < moved / limit_frac**2
+
+
+def _displacement(target: Target) -> Floats:
+    """Return what carries a motion (7,) to the displacement of the target, so that its norm is the rms."""
+    arms = target.search.grid.points[:400]
+    moves = np.stack([np.concatenate([np.cross(np.eye(3)[k], a) for a in arms]) for k in range(3)], axis=1)
+    shifts = np.tile(np.eye(3), (len(arms), 1))
+    return np.asarray(np.concatenate([moves, shifts, arms.reshape(-1, 1)], axis=1) / np.sqrt(len(arms)))
+
+
+def _information(fit: Fit) -> Floats:
+    sigma = max(fit.patch_sigma_frac, 3e-4)
+    return np.asarray((fit.patches.jacobian * fit.weight[:, None]).T @ fit.patches.jacobian / (3 * sigma) ** 2)
 
 
 def _spread(residual: Floats) -> float:

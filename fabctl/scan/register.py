@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +18,16 @@ from scipy.spatial import cKDTree
 
 from design.findings import Finding
 from fabctl.events import Emit, Event, silent
-from fabctl.scan.borders import circle
+from fabctl.scan.borders import circle, rim_axis, turn_motion
 from fabctl.scan.clean import Cleaned, Part
 from fabctl.scan.coarse import search, search_cloud
 from fabctl.scan.decide import HELD_FRAC, Datums, decide_by_border, decide_by_datums, decide_by_paint
+from fabctl.scan.edges import edge_finder
 from fabctl.scan.judge import Judged, judge, thin
 from fabctl.scan.paint import Paint
-from fabctl.scan.refine import Options, moved_by, refine, weak_motions
+from fabctl.scan.refine import Options, is_weak, moved_by, refine, weak_motions
 from fabctl.scan.rim import Rest
+from fabctl.scan.said import Status, findings_of
 from fabctl.scan.similarity import Similarity
 from fabctl.scan.symmetry import Symmetries, find_mirrors
 from fabctl.scan.target import Closest, Target
@@ -44,10 +45,11 @@ CANDIDATES = 6
 LEAST_MEMBERS = 200
 MIRROR_BETTER_RATIO = 0.7
 MIRROR_DOUBT_FRAC = 0.005
-SAME_POSE_FRAC = 0.004
+SAME_POSE_FRAC, NEAR_POSE_FRAC = 0.004, 0.06
+FINAL_ROUNDS, SETTLED_FRAC = 3, 1e-4  # of the diagonal
 PUSHES_FRAC = (-0.04, -0.015, 0.015, 0.04)
 
-Status = Literal["aligned", "symmetric", "ambiguous", "failed", "mirrored"]
+NO_SYMMETRIES = Symmetries((), None, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,8 +153,18 @@ def pushed(task: Task, body: Body, best: Judged) -> list[Judged]:
         for motion in weak
         for push in PUSHES_FRAC
     ]
-    turned = [start for motion in weak[:1] for start in circle(body.tree, best.pose, motion, task.target).likeliest()]
-    return near + [tried(task, body, start, "turned until the border fits") for start in turned]
+    return near + [tried(task, body, start, "turned until the border fits") for start in _turned(task, body, best)]
+
+
+def _turned(task: Task, body: Body, best: Judged) -> list[Similarity]:
+    """Return the pose turned about the rim's axis to where the rest of the border fits, if the surface allows it."""
+    axis = rim_axis(task.target)
+    if axis is None or task.symmetries.continuous:
+        return []
+    finder = edge_finder(body.dense, best.pose, task.target)
+    if finder is None or not is_weak(turn_motion(axis, task.target), best.fit, task.target, HELD_FRAC):
+        return []
+    return circle(body.tree, finder, best.pose, axis).likeliest()
 
 
 def register(task: Task) -> Registration:
@@ -190,8 +202,9 @@ def register(task: Task) -> Registration:
 
 def _decided(task: Task, body: Body, found: list[Judged]) -> Registration:
     """Return the answer from the distinct poses, the best first."""
+    found = _settled(task, body, found)
     best = found[0]
-    rivals = [j for j in found[1:] if j.score_frac <= RIVAL_RATIO * best.score_frac]
+    rivals = _rivals(found)
     turned = list(_symmetric(task, body, best))
     if task.datums is not None:
         chosen, single = decide_by_datums([best, *turned, *rivals], task.datums, task.target, task.symmetries)
@@ -205,12 +218,36 @@ def _decided(task: Task, body: Body, found: list[Judged]) -> Registration:
             others = tuple(j for j in (best, *turned, *rivals) if j.fit.patches is not painted.fit.patches)
             return _finished(task, "aligned", painted, others, body, "colour")
     if rivals and not turns:
-        single_out = decide_by_border(body.tree, [best, *rivals], task.target, task.options)
+        finder = edge_finder(body.dense, best.pose, task.target)
+        single_out = None if finder is None else decide_by_border(finder, body.tree, [best, *rivals], task.symmetries)
         if single_out is not None:
             others = tuple(j for j in (best, *rivals) if j is not single_out)
             return _finished(task, "aligned", single_out, others, body, "border")
     status: Status = "ambiguous" if rivals else "symmetric" if turns else "aligned"
     return _finished(task, status, best, (*turned, *rivals), body)
+
+
+def _rivals(found: list[Judged]) -> list[Judged]:
+    return [j for j in found[1:] if j.score_frac <= RIVAL_RATIO * found[0].score_frac]
+
+
+def _settled(task: Task, body: Body, found: list[Judged]) -> list[Judged]:
+    """Return the poses, the best first, where those that lie near the best are refined again with all the points.
+
+    A surface that slides in itself is held by its rim alone, and few points show a rim only roughly: what looks like
+    two poses may be one.
+    """
+    best = found[0]
+    near = [j for j in _rivals(found) if task.symmetries.apart_frac(best.pose, j.pose, task.target) < NEAR_POSE_FRAC]
+    if not near:
+        return found
+    rest = [j for j in found[1:] if not any(j is n for n in near)]
+    again = [refine(body.dense, j.pose, task.target, task.options) for j in (best, *near)]
+    sharper = [
+        judge(fit, body.even[:JUDGE_POINTS], body.dense, task.target, j.relation)
+        for fit, j in zip(again, (best, *near), strict=True)
+    ]
+    return _distinct(task, [*sharper, *rest])
 
 
 def _by_paint(task: Task, body: Body, candidates: list[Judged]) -> Judged | None:
@@ -267,11 +304,14 @@ def _finished(
 ) -> Registration:
     specimen = specimen_points(task, body.part, best.pose)
     if status in ("aligned", "symmetric") and specimen.sum() > 500:
-        chosen = task.points[specimen]
-        final = refine(chosen[:: max(1, len(chosen) // FINAL_POINTS)], best.pose, task.target, task.options)
-        best = replace(best, fit=final)
-        specimen = specimen_points(task, body.part, best.pose)
-    findings = tuple(_findings(task, status, best, alternatives))
+        for _ in range(FINAL_ROUNDS):  # which points are the specimen hangs a little on the pose
+            chosen, before = task.points[specimen], best.pose
+            final = refine(chosen[:: max(1, len(chosen) // FINAL_POINTS)], before, task.target, task.options)
+            best = replace(best, fit=final)
+            specimen = specimen_points(task, body.part, best.pose)
+            if NO_SYMMETRIES.apart_frac(before, best.pose, task.target) < SETTLED_FRAC:
+                break
+    findings = tuple(findings_of(status, best, alternatives, body.part, task.cleaned, task.symmetries, task.target))
     return Registration(status, best, alternatives, body.part, specimen, task.symmetries, findings, decided_by)
 
 
@@ -285,15 +325,23 @@ def specimen_points(task: Task, part: Part, pose: Similarity) -> Mask:
     placed = pose(cells.centre[dense])
     found = target.closest(placed)
     near[dense] = np.linalg.norm(placed - found.points_mm, axis=1) < band_mm
-    if cleaned.table is not None and "plane kept" not in part.name:
-        near[dense] &= ~_too_low(found, pose, cleaned)
     held = np.zeros(len(task.points), dtype=bool)
     inside = cells.of_point >= 0
     held[inside] = (near & ((cleaned.cluster >= 0) | part.cells))[cells.of_point[inside]]
-    return held if "plane kept" in part.name else held & ~cleaned.is_table
+    if "plane kept" in part.name:
+        return held
+    held &= ~cleaned.is_table
+    if cleaned.table is not None:
+        low = np.zeros(len(cells.count), dtype=bool)
+        low[dense] = _too_low(found, pose, cleaned, room_cu=2 * cells.size_cu)
+        # A cell's middle lies where noise put it; which points are too low their own feet must say.
+        asked = np.flatnonzero(held)
+        asked = asked[low[cells.of_point[asked]]]
+        held[asked] = ~_too_low(target.closest(pose(task.points[asked])), pose, cleaned)
+    return held
 
 
-def _too_low(found: Closest, pose: Similarity, cleaned: Cleaned) -> Mask:
+def _too_low(found: Closest, pose: Similarity, cleaned: Cleaned, room_cu: float = 0.0) -> Mask:
     """Return where the target lies so near to the table that only points with upward noise were kept as specimen.
 
     There the scan would seem to deviate upwards. The more level the surface, the more of the noise is upwards.
@@ -302,49 +350,4 @@ def _too_low(found: Closest, pose: Similarity, cleaned: Cleaned) -> Mask:
     back = pose.inverse()
     height = cleaned.table.height(back(found.points_mm))
     level = np.abs((found.normals @ pose.rotation) @ cleaned.table.normal)
-    return np.asarray(height < cleaned.table_top_cu * (1 + 0.9 * level))
-
-
-def _findings(task: Task, status: Status, best: Judged, alternatives: tuple[Judged, ...]) -> Iterator[Finding]:
-    cleaned, symmetries, target = task.cleaned, task.symmetries, task.target
-    if status == "failed":
-        yield Finding(
-            "SCAN-NO-FIT",
-            f"no pose explains the cloud: the best leaves {best.score_frac:.2%} of the diagonal (rms), covers "
-            f"{best.coverage_frac:.0%} of the target and explains {best.explained_frac:.0%} of the points",
-            hint="is it the right target and cloud, and is the specimen's own cloud large enough?",
-        )
-    if status == "mirrored":
-        yield Finding(
-            "SCAN-MIRROR",
-            f"the cloud is the mirror image of the target (fits to {best.score_frac:.2%} of the diagonal): the "
-            "specimen was deployed to the other side, or cut from the mirrored pattern",
-            hint="snap it to the other side, or compare with the mirrored target",
-        )
-    if status == "ambiguous":
-        worst = max(a.score_frac for a in alternatives) / best.score_frac - 1
-        yield Finding(
-            "SCAN-AMBIGUOUS",
-            f"{len(alternatives)} other poses fit within {worst:.1%} of the best; geometry cannot decide",
-            hint="give three datum points (--datum), markers, or scan more of the specimen",
-        )
-    if status == "symmetric":
-        for line in symmetries.describe():
-            yield Finding(
-                "SCAN-SYMMETRY",
-                f"the target has a symmetry, so the pose is known only up to it: {line}",
-                level="warning",
-                hint="datum points (--datum) decide; the numbers hold for every such pose listed",
-            )
-    if status in ("aligned", "symmetric", "ambiguous") and cleaned.table is not None:
-        up = best.pose.rotation @ cleaned.table.normal
-        area = target.mesh.face_areas_mm2()
-        a, b, c = (target.mesh.vertices_mm[target.mesh.faces[:, k]] for k in range(3))
-        facing = np.cross(b - a, c - a).sum(axis=0) / (2 * area.sum())
-        if float(facing @ up) < -0.3:
-            yield Finding(
-                "SCAN-OTHER-SIDE",
-                "on its table the specimen shows its back: it lies upside down or was deployed to the other side",
-                level="warning",
-                hint="look which face is marked; for a target that is its own mirror image geometry cannot tell",
-            )
+    return np.asarray(height < cleaned.table_top_cu * (1 + 0.9 * level) + room_cu)

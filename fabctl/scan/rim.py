@@ -67,7 +67,7 @@ def rim_rows(
     gap, at = placed[near] - border.points_mm[at[near]], at[near]
     level = np.abs(np.sum(gap * border.normals[at], axis=1)) < 0.4 * reach_frac * size
     gap, at = gap[level], at[level]
-    stretch_of = _stretches(border.points_mm, border.loop, max(8, min(STRETCHES, len(gap) // 40)))
+    stretch_of = stretches(border.points_mm, border.loop, max(8, min(STRETCHES, len(gap) // 40)))
     out, stretch = np.sum(gap * border.outward[at], axis=1) / size, stretch_of[at]
     count = np.bincount(stretch, minlength=stretch_of.max() + 1)
     used = np.flatnonzero(count >= LEAST_POINTS)
@@ -96,7 +96,7 @@ def _slack(target: Target, pose: Similarity, rest: Rest | None) -> Floats:
     return np.where(share > 0.2, SLACK_ON_TABLE_FRAC, SLACK_FRAC)
 
 
-def _stretches(points: Floats, loop: Ints, count: int) -> Ints:
+def stretches(points: Floats, loop: Ints, count: int) -> Ints:
     """Return for each border sample the number of its stretch; a stretch never spans two loops."""
     found = np.empty(len(points), dtype=np.int64)
     done = 0

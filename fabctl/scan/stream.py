@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.findings import Finding
-from fabctl.errors import RefusedError
+from fabctl.errors import RefusedError, UnreadableInput
+from fabctl.scan.columns import HEAD_BYTES, Columns, comma_is_decimal, named_columns, said_columns
 
 Floats = NDArray[np.float64]
+Triple = tuple[int, int, int]
 
 PIECE = 500_000  # points of a binary file read at once
 TEXT_BYTES = 32_000_000  # bytes of a text file read at once
@@ -180,17 +182,20 @@ def _ply_piece(column: dict[str, NDArray[np.generic]], header: PlyHeader) -> Pie
 
 def _cut_short(path: Path, count: int, left: int) -> RefusedError:
     said = f"the file ends after {count - left} of {count} points"
-    return RefusedError(f"{path}: cannot be compared", [Finding("SCAN-CUT", said, where=str(path))])
+    return UnreadableInput(f"{path}: cannot be compared", [Finding("SCAN-CUT", said, where=str(path))])
 
 
 # --- text ------------------------------------------------------------------------------------------------------------
 
 
-def text_rows(path: Path, offset: int = 0, width: int | None = None) -> Iterator[tuple[Floats, int]]:
+def text_rows(
+    path: Path, offset: int = 0, width: int | None = None, *, decimal_comma: bool = False
+) -> Iterator[tuple[Floats, int]]:
     """Yield rows of numbers and how many lines in between hold none; the first line with three numbers sets the width.
 
-    Numbers are parted by blanks, commas or semicolons.
+    Numbers are parted by blanks, commas or semicolons; with `decimal_comma` the comma belongs to the number.
     """
+    marks = bytes.maketrans(b",;\t", b".  " if decimal_comma else b"   ")
     with path.open("rb") as stream:
         stream.seek(offset)
         while True:
@@ -198,7 +203,7 @@ def text_rows(path: Path, offset: int = 0, width: int | None = None) -> Iterator
             if not text:
                 return
             text += stream.readline()
-            text = text.translate(bytes.maketrans(b",;\t", b"   "))
+            text = text.translate(marks)
             if width is None:
                 width = _width(text)
             if width is not None:
@@ -236,27 +241,44 @@ def _numbers(line: bytes) -> list[float] | None:
         return None
 
 
-def text_pieces(path: Path, skipped: list[int]) -> Iterator[Piece]:
-    """Yield the points of a text file `x y z [nx ny nz] [r g b]`; lines without a point are counted in `skipped`."""
-    first: tuple[int | None, int | None, float] | None = None
-    for rows, lost in text_rows(path):
+def text_pieces(path: Path, skipped: list[int], said: list[Finding]) -> Iterator[Piece]:
+    """Yield the points of a text file; lines without a point are counted in `skipped`.
+
+    Columns are those the header names, which is `said`; without one they are `x y z [nx ny nz] [r g b]`.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(HEAD_BYTES)
+    named = named_columns(head, str(path))
+    if named is not None:
+        said.append(said_columns(named))
+    meant: tuple[Triple, Triple | None, Triple | None, float] | None = None
+    for rows, lost in text_rows(path, decimal_comma=comma_is_decimal(head)):
         skipped.append(lost)
         if len(rows) == 0:
             continue
-        first = first or _meaning(rows)
-        normals, colours, gain = first
+        meant = meant or (_meaning(rows) if named is None else _as_named(rows, named, path))
+        places, normals, colours, gain = meant
         yield Piece(
-            np.ascontiguousarray(rows[:, :3]),
+            np.ascontiguousarray(rows[:, places]),
             _extra(
-                None if normals is None else rows[:, normals : normals + 3],
-                None if colours is None else gain * rows[:, colours : colours + 3],
+                None if normals is None else rows[:, normals],
+                None if colours is None else gain * rows[:, colours],
                 len(rows),
             ),
         )
 
 
-def _meaning(rows: Floats) -> tuple[int | None, int | None, float]:
-    """Return the columns where normals and colours begin, and what makes the colours 0 to 255."""
+def _as_named(rows: Floats, named: Columns, path: Path) -> tuple[Triple, Triple | None, Triple | None, float]:
+    if rows.shape[1] < named.width:
+        said = f"the header names {named.width} columns, the rows have {rows.shape[1]}"
+        raise RefusedError(f"{path}: cannot be compared", [Finding("SCAN-HEADER", said, where=str(path))])
+    most = 0.0 if named.colours is None else float(rows[:, named.colours].max())
+    gain = 255.0 if most <= 1 else 1.0 if most <= 255 else 1 / 257
+    return named.places, named.normals, named.colours, gain
+
+
+def _meaning(rows: Floats) -> tuple[Triple, Triple | None, Triple | None, float]:
+    """Return the columns of places, normals and colours by their range, and what makes the colours 0 to 255."""
     normals = colours = None
     gain = 1.0
     for at in range(3, min(rows.shape[1], COLUMNS + 1) - 2):
@@ -268,7 +290,11 @@ def _meaning(rows: Floats) -> tuple[int | None, int | None, float]:
             colours, gain = at, 255.0 if some.max() <= 1 else 1.0
             if rows.shape[1] == 7 and at == 3:  # x y z intensity r g b
                 colours = 4
-    return normals, colours, gain
+    return (0, 1, 2), _three_from(normals), _three_from(colours), gain
+
+
+def _three_from(first: int | None) -> Triple | None:
+    return None if first is None else (first, first + 1, first + 2)
 
 
 # --- LAS -------------------------------------------------------------------------------------------------------------
@@ -293,6 +319,5 @@ def las_pieces(path: Path) -> Iterator[Piece]:
                     colours = colours * gain
                 yield Piece(points.astype(np.float64), _extra(None, colours, len(points)))
     except (laspy.errors.LaspyException, OSError, ValueError) as fault:
-        raise RefusedError(
-            f"{path}: cannot be compared", [Finding("SCAN-LAS", f"not a LAS file: {fault}", where=str(path))]
-        ) from fault
+        said = Finding("SCAN-LAS", "not a LAS file, or damaged", where=str(path))
+        raise UnreadableInput(f"{path}: cannot be compared", [said]) from fault

@@ -155,7 +155,7 @@ class Border:
     along: Floats  # (k, 3)
     normals: Floats  # (k, 3)
     loop: Ints  # (k,), which closed loop of the border
-    spacing_mm: float
+    length_mm: Floats  # (k,), of border that each sample stands for
 
 
 def even_samples(mesh: TriMesh, vertex_normals: Floats, count: int, seed: int = 7) -> tuple[Floats, Floats, Ints]:
@@ -195,7 +195,7 @@ def _border(target: Target) -> Border | None:
         along[which],
         normal[which],
         _loops(target, face, corner)[which],
-        spacing,
+        (length / share)[which],
     )
 
 

@@ -6,22 +6,22 @@ any height can be looked at. Marks are used by their centres, which neither ink 
 
 from __future__ import annotations
 
-import json
+import itertools
 import math
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from design.findings import Finding, errors
 from fabctl.errors import RefusedError, UsageError
+from fabctl.files import json_of, why_not
 from fabctl.records.folder import as_json, write_atomically
 from fabctl.vision.boards import MarkSheet
 from fabctl.vision.lens import Lens, lens_from
-from fabctl.vision.markers import Marker, find_markers, mirrored
+from fabctl.vision.markers import Marker, find_all, mirrored
 from fabctl.vision.quality import picture_findings
 from fabctl.vision.template import F64
 
@@ -103,19 +103,24 @@ def align(
 
 
 def known_markers(image: NDArray[np.uint8], sheet: MarkSheet) -> list[Marker]:
-    """Return the markers in the picture that belong to the sheet."""
+    """Return the markers in the picture that belong to the sheet; one that lies there twice comes twice."""
     ids = {mark.id for mark in sheet.marks}
-    return [marker for marker in find_markers(image, sheet.family) if marker.id in ids]
+    return [marker for marker in find_all(image, sheet.family) if marker.id in ids]
 
 
 def mark_findings(markers: list[Marker], image: NDArray[np.uint8], sheet: MarkSheet, least: int) -> list[Finding]:
-    """Return what speaks against these markers: too few, mirrored, or all in one corner."""
+    """Return what speaks against these markers: too few, mirrored, all in one corner, or of two such sheets."""
+    twice = sorted({a.id for a, b in itertools.pairwise(sorted(markers, key=lambda m: m.id)) if a.id == b.id})
+    if twice:
+        text = f"mark{'s' if len(twice) > 1 else ''} {', '.join(map(str, twice))} of {sheet.name} seen at two places"
+        return [Finding("MARKS-TWICE", text, where=sheet.name, hint="two such sheets? take one away, or cover it")]
     if len(markers) < least:
         ids = {mark.id for mark in sheet.marks}
         turned = [m for m in mirrored(image, sheet.family) if m.id in ids]
         if len(turned) > len(markers):
             text = f"{len(turned)} marks of {sheet.name} are seen mirrored: the sheet lies upside down"
-            return [Finding("MARKS-MIRRORED", text, where=sheet.name, hint="turn the sheet over")]
+            hint = "turn the sheet over; if the picture itself is mirrored (by a mirror, from below), set the camera so"
+            return [Finding("MARKS-MIRRORED", text, where=sheet.name, hint=f"{hint} that it is not")]
         text = f"{len(markers)} of {len(sheet.marks)} marks of {sheet.name} found, at least {least} are needed"
         return [Finding("MARKS-FEW", text, where=sheet.name, hint="covered, blurred, glare, or another sheet?")]
     places = np.array([(m.x_mm, m.y_mm) for m in (sheet.mark(k.id) for k in markers) if m is not None])
@@ -229,13 +234,13 @@ def drift_findings(image: NDArray[np.uint8], source: str, alignment: Alignment, 
 
 
 def witness_drift_mm(image: NDArray[np.uint8], alignment: Alignment) -> dict[int, float]:
-    """Return, for each witness in the picture, how far from its place it is seen, mm."""
+    """Return, for each witness in the picture, how far from its place it is seen, mm; of two of an id the farther."""
     then = {witness.id: np.array([witness.u_px, witness.v_px]) for witness in alignment.witnesses}
-    found = {}
-    for marker in find_markers(image):
+    found: dict[int, float] = {}
+    for marker in find_all(image):
         if marker.id in then:
             both = alignment.to_machine(np.array([marker.centre_px, then[marker.id]]))
-            found[marker.id] = float(np.linalg.norm(both[0] - both[1]))
+            found[marker.id] = max(found.get(marker.id, 0.0), float(np.linalg.norm(both[0] - both[1])))
     return found
 
 
@@ -269,8 +274,10 @@ def write_alignment(alignment: Alignment, path: Path) -> None:
 
 def read_alignment(path: Path) -> Alignment:
     """Return the alignment in the file; raise `UsageError` where there is none."""
+    if not path.exists():
+        raise UsageError(f"{path}: the bed is not aligned yet; run `fabctl camera align`")
+    data = json_of(path, "an alignment of `fabctl camera align`")
     try:
-        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if data["format"] != FORMAT:
             raise UsageError(f"{path}: alignment format {data['format']}, this tool reads {FORMAT}; align again")
         height_mm, rms_mm, worst_mm = (float(data[key]) for key in ("height_mm", "rms_mm", "worst_mm"))
@@ -287,7 +294,5 @@ def read_alignment(path: Path) -> Alignment:
             str(data["made_utc"]),
             str(data["marks"]),
         )
-    except FileNotFoundError:
-        raise UsageError(f"{path}: the bed is not aligned yet; run `fabctl camera align`") from None
-    except (OSError, KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{path}: not an alignment: {fault}; run `fabctl camera align`") from fault
+    except (KeyError, TypeError, ValueError) as fault:
+        raise UsageError(f"{path}: not an alignment: {why_not(fault)}; run `fabctl camera align`") from fault

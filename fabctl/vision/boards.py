@@ -77,6 +77,12 @@ class Charuco:
     marker_mm: float
     family: Family = "5x5_250"
     first_id: int = CHARUCO_IDS.start
+    legacy: bool = False  # upper left square white where the rows are even, as OpenCV drew them before 4.6
+
+    @property
+    def first_is_white(self) -> bool:
+        """Say whether the upper left square is white."""
+        return self.legacy and self.rows_count % 2 == 0
 
     @property
     def size_mm(self) -> tuple[float, float]:
@@ -91,7 +97,12 @@ class Charuco:
     @property
     def marks(self) -> tuple[Mark, ...]:
         """Return the markers, in the sheet's frame (y up)."""
-        columns = [(c, r) for r in range(self.rows_count) for c in range(self.columns_count) if (c + r) % 2]
+        columns = [
+            (c, r)
+            for r in range(self.rows_count)
+            for c in range(self.columns_count)
+            if (c + r + self.first_is_white) % 2
+        ]
         s, top = self.square_mm, self.size_mm[1]
         return tuple(
             Mark(int(number), (c + 0.5) * s, top - (r + 0.5) * s, self.marker_mm)
@@ -120,7 +131,7 @@ def charuco_ink(board: Charuco) -> list[Rectangle]:
         np.array([c * s, top - (r + 1) * s]) + unit * s
         for r in range(board.rows_count)
         for c in range(board.columns_count)
-        if (c + r) % 2 == 0
+        if (c + r + board.first_is_white) % 2 == 0
     ]
     return squares + [rectangle for mark in board.marks for rectangle in mark_ink(mark, board.family)]
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.camera import read_picture
 from fabctl.errors import UsageError
+from fabctl.files import picture_of, text_of
 from fabctl.vision.boards import MarkSheet
 from fabctl.vision.markers import find_markers
 from fabctl.vision.scale import ScanScale, ShotPose, scale_by_shots
@@ -31,7 +31,9 @@ def read_model(folder: Path) -> dict[str, ShotPose]:
             lenses[words[0]] = _lens(words[1], [float(word) for word in words[4:]])
         except (KeyError, IndexError, ValueError) as fault:
             known = ", ".join(MODELS)
-            raise UsageError(f"{folder / 'cameras.txt'}:{number}: not a camera ({fault}); known are {known}") from fault
+            raise UsageError(
+                f"{folder / 'cameras.txt'}:{number}: not a camera ({_why(fault)}); known are {known}"
+            ) from fault
     poses = {}
     # Each picture has two lines; the second lists its feature points, and may be empty.
     for number, words in _rows(folder / "images.txt", every_second=True):
@@ -40,7 +42,7 @@ def read_model(folder: Path) -> dict[str, ShotPose]:
             K, distortion = lenses[words[8]]
             poses[" ".join(words[9:])] = ShotPose(K, distortion, _rotation(quaternion), t)
         except (KeyError, IndexError, ValueError) as fault:
-            raise UsageError(f"{folder / 'images.txt'}:{number}: not a picture's pose ({fault})") from fault
+            raise UsageError(f"{folder / 'images.txt'}:{number}: not a picture's pose ({_why(fault)})") from fault
     if not poses:
         raise UsageError(f"{folder / 'images.txt'}: no pictures")
     return poses
@@ -54,20 +56,24 @@ def scale_from_pictures(model: Path, pictures: Path, sheet: MarkSheet) -> ScanSc
     known = {mark.id for mark in sheet.marks}
     shots = []
     for name, pose in read_model(model).items():
-        markers = find_markers(read_picture(pictures / name).image, sheet.family)
+        markers = find_markers(picture_of(pictures / name).image, sheet.family)
         shots.append((pose, {m.id: m.centre_px + 0.5 for m in markers if m.id in known}))
     return scale_by_shots(shots, sheet)
 
 
 def _rows(path: Path, every_second: bool = False) -> list[tuple[int, list[str]]]:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as fault:
-        raise UsageError(f"{path}: cannot be read: {fault}") from fault
+    lines = text_of(path, "a COLMAP text model").splitlines()
     rows = [(n, line.split()) for n, line in enumerate(lines, start=1) if not line.startswith("#")]
     if every_second:
         return [row for row in rows[::2] if row[1]]
     return [row for row in rows if row[1]]
+
+
+def _why(fault: Exception) -> str:
+    """Return what a line of numbers lacks, in words."""
+    if isinstance(fault, KeyError):
+        return f"{fault.args[0]} is not known"
+    return "too few words" if isinstance(fault, IndexError) else "a number was expected"
 
 
 def _lens(model: str, numbers: list[float]) -> tuple[F64, F64]:

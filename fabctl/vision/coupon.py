@@ -14,6 +14,7 @@ import numpy as np
 from design.export.gcode import END, GcodeOptions, gcode
 from design.pattern.paths import CutPath, LayerPreset
 from fabctl.errors import UsageError
+from fabctl.files import why_not
 from fabctl.vision.boards import COUPON_IDS, Mark, MarkSheet, hatch, sheet_ink
 from fabctl.vision.template import F64
 
@@ -152,7 +153,7 @@ def coupon_from(data: dict[str, object], where: str) -> Coupon:
             raise UsageError(f"{where}: coupon format {data['format']}, this tool reads {FORMAT}")
         powers, feed, passes = data["powers_frac"], data["feed_mm_s"], data["passes_count"]
         if not isinstance(powers, list) or not isinstance(feed, int | float) or not isinstance(passes, int):
-            raise TypeError("powers_frac must be a list, feed_mm_s a number, passes_count a whole number")
+            raise ValueError("powers_frac must be a list, feed_mm_s a number, passes_count a whole number")
         return make_coupon([float(p) for p in powers], float(feed), passes)
     except (KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{where}: not a coupon: {fault}") from fault
+        raise UsageError(f"{where}: not a coupon: {why_not(fault)}") from fault

@@ -84,7 +84,7 @@ def _rulers(drawing: Drawing) -> list[str]:
     strokes = [(0, d, w, d), (0, d - 1.5, 0, d + 1.5), (w, d - 1.5, w, d + 1.5)]
     strokes += [(d, 0, d, h), (d - 1.5, 0, d + 1.5, 0), (d - 1.5, h, d + 1.5, h)]
     lines = ["0.1 w"] + [f"{a:.4f} {b:.4f} m {c:.4f} {e:.4f} l S" for a, b, c, e in strokes]
-    advice = f"Print at 100 %. Measure both rulers: {w:g} mm across, {h:g} mm up; tell `fabctl camera board measured`."
+    advice = f"Print at 100 %. Measure both rulers ({w:g} mm across, {h:g} mm up), then: fabctl camera board measured"
     text = f"{drawing.title}. {advice}"
     safe = text.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
     size = min(TEXT_MM, w / (0.5 * len(text)))

@@ -8,8 +8,9 @@ larger modules and a flatter look.
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -26,6 +27,7 @@ MODULES = 8  # of one marker, frame included
 GAP_MODULES = 2
 PITCH = 2 * (MODULES + GAP_MODULES) / MODULES  # from centre to centre, in the marker's own frame (-1 to 1)
 MOST_MISPLACED = 0.25  # of the partner's centre, in the same frame
+ENOUGH_PX = 2e6  # pictures of more are first looked at smaller
 LARGEST = BASE * BASE - 1
 NAME = re.compile(r"S-(\d{4,})")
 
@@ -111,7 +113,22 @@ def id_paths(
 
 
 def read_ids(image: NDArray[np.uint8], *, upscale: int = 2, smallest_px: float = 14.0) -> list[EngravedId]:
-    """Return every id in a grey picture (h, w), by name: marker pairs first, then QR codes."""
+    """Return every id in a grey picture (h, w), by name: marker pairs first, then QR codes.
+
+    A large picture is searched from coarse to fine, and no finer than where it shows ids.
+    """
+    import cv2
+
+    halvings = max(0, math.ceil(math.log2(math.sqrt(image.size / ENOUGH_PX)))) if image.size else 0
+    for step in (2**k for k in range(halvings, 0, -1)):
+        small = cv2.resize(image, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA)
+        found = _read(np.asarray(small, dtype=np.uint8), 1, smallest_px)
+        if found:
+            return [replace(one, corners_px=(one.corners_px + 0.5) * step - 0.5) for one in found]
+    return _read(image, upscale, smallest_px)
+
+
+def _read(image: NDArray[np.uint8], upscale: int, smallest_px: float) -> list[EngravedId]:
     markers = find_markers(image, FAMILY, upscale=upscale, inverted=True, smallest_px=smallest_px)
     grey = np.ascontiguousarray(image, dtype=np.float64)
     found: dict[str, EngravedId] = {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from design.findings import Finding, errors
 from fabctl.errors import RefusedError, UsageError
+from fabctl.files import json_of, why_not
 from fabctl.records.folder import as_json, write_atomically
 from fabctl.vision.boards import Charuco
 from fabctl.vision.markers import FAMILIES
@@ -94,12 +94,14 @@ def find_board(image: NDArray[np.uint8], board: Charuco, source: str) -> tuple[B
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[board.family]))
     size = (board.columns_count, board.rows_count)
     print_ = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary, board.ids)
+    print_.setLegacyPattern(board.legacy)
     detector = cv2.aruco.CharucoDetector(print_)
     corners, ids, _, marker_ids = detector.detectBoard(image)
     seen = set() if marker_ids is None else {int(k) for k in np.ravel(marker_ids)}
     count = 0 if ids is None else len(ids)
     strange = seen - {int(k) for k in board.ids}
-    if len(strange) > len(seen) / 4 and len(strange) >= 3:
+    # Marks of the bed around the board are strange too, and do no harm.
+    if len(strange) > len(seen) - len(strange) and len(strange) >= 3:
         hint = "give the board file of the board in the picture"
         return None, [
             Finding(
@@ -132,7 +134,9 @@ def _layout_error(view: BoardView, board: Charuco) -> float:
 
 def _misfit(source: str, board: Charuco) -> Finding:
     text = f"the corners do not lie as {board.name} ({board.columns_count} x {board.rows_count}) says"
-    return Finding("LENS-BOARD", text, where=source, hint="another board, or a bent one")
+    return Finding(
+        "LENS-BOARD", text, where=source, hint="another board, a bent one, or of an old program (legacy: true)?"
+    )
 
 
 def calibrate(views: Sequence[BoardView], size_px: tuple[int, int], board: Charuco, made_utc: str) -> Calibration:
@@ -206,11 +210,16 @@ def _rotation(turn: F64) -> F64:
 
 def _coverage(views: Sequence[BoardView], size_px: tuple[int, int]) -> float:
     """Return which part of the frame's cells holds at least one corner."""
+    return len(covered_cells(views, size_px)) / math.prod(COVERAGE_CELLS)
+
+
+def covered_cells(views: Sequence[BoardView], size_px: tuple[int, int]) -> set[tuple[int, int]]:
+    """Return column and row of every cell of the frame that holds at least one corner."""
     if not views:
-        return 0.0
+        return set()
     points = np.vstack([view.corners_px for view in views]) / np.array(size_px)
     cells = np.clip((points * np.array(COVERAGE_CELLS)).astype(int), 0, np.array(COVERAGE_CELLS) - 1)
-    return len({tuple(cell) for cell in cells}) / math.prod(COVERAGE_CELLS)
+    return {(int(column), int(row)) for column, row in cells}
 
 
 def _disagreement(first: tuple[F64, F64], second: tuple[F64, F64], size_px: tuple[int, int]) -> float:
@@ -257,14 +266,9 @@ def lens_from(data: dict[str, Any], where: str) -> Lens:
         made, board = str(data["made_utc"]), str(data["board"])
         return Lens((int(w), int(h)), K, distortion, rms_px, repeat_px, coverage, int(data["views_count"]), made, board)
     except (KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{where}: not a lens file: {fault}") from fault
+        raise UsageError(f"{where}: not a lens file: {why_not(fault)}") from fault
 
 
 def read_lens(path: Path) -> Lens:
     """Return the lens in the file."""
-    try:
-        return lens_from(json.loads(path.read_text(encoding="utf-8")), str(path))
-    except OSError as fault:
-        raise UsageError(f"{path}: {fault.strerror}; measure the lens with `fabctl camera calibrate`") from fault
-    except ValueError as fault:
-        raise UsageError(f"{path}: not JSON: {fault}") from fault
+    return lens_from(json_of(path, "a lens of `fabctl camera calibrate`"), str(path))

@@ -42,10 +42,12 @@ HOPELESS_RATIO = 0.6  # no change of blur brings a first fit below this to ACCEP
 # and 0.34: the whole, the code alone, its lead over other codes, the worst module.
 SKETCH_RATIO, SKETCH_CODE_RATIO, SKETCH_LEAD_RATIO, SKETCH_WRONG_MODULE = 0.65, 0.5, -0.05, 1.5
 SKETCH_STEPS = 8
+ENOUGH_SIDE_PX = 1600  # a picture still larger is halved once more
 SAME_QUAD_RATIO = 0.02  # of the side: nearer outlines are one and the same
 SCREEN_RATIO = 0.45  # correlation with the bare frame that a quadrilateral needs to be looked at further
 BLURS_px = (0.5, 0.9, 1.4, 2.0, 3.0)
 COARSE_PER_MODULE = 3
+LIKELY_COUNT = 24  # codes that are compared at every blur
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,18 +99,34 @@ def find_markers(
     `upscale` enlarges the picture for the search alone, for markers of few pixels; `inverted` also takes light markers
     on dark ground; `smallest_px` is the least side of a marker.
     """
+    best: dict[int, Marker] = {}
+    for marker in find_all(image, family, upscale=upscale, inverted=inverted, smallest_px=smallest_px):
+        if marker.id not in best or best[marker.id].score_ratio < marker.score_ratio:
+            best[marker.id] = marker
+    return [best[k] for k in sorted(best)]
+
+
+def find_all(
+    image: NDArray[np.uint8],
+    family: Family = "5x5_250",
+    *,
+    upscale: int = 1,
+    inverted: bool = False,
+    smallest_px: float = 20.0,
+) -> list[Marker]:
+    """Return every marker in the picture, by id; an id that lies at two places comes twice. As `find_markers`."""
     grey = np.ascontiguousarray(image, dtype=np.float64)
-    found: dict[int, Marker] = {}
+    found: list[Marker] = []
     refused: list[F64] = []
     for quad in _quadrilaterals(image, family, upscale, inverted, smallest_px):
-        if any(_same_place(quad, marker) for marker in found.values()) or _among(quad, refused):
+        if any(_same_place(quad, marker) for marker in found) or _among(quad, refused):
             continue  # OpenCV proposes the same outline once for each of its thresholds
         marker = read_quadrilateral(grey, quad, family, inverted)
         if marker is None:
             refused.append(quad)
-        if marker and (marker.id not in found or found[marker.id].score_ratio < marker.score_ratio):
-            found[marker.id] = marker
-    return [found[k] for k in sorted(found)]
+        elif not any(_same_place(marker.corners_px, other) for other in found):
+            found.append(marker)
+    return sorted(found, key=lambda marker: marker.id)
 
 
 def _same_place(quad: F64, marker: Marker) -> bool:
@@ -139,17 +157,31 @@ def read_quadrilateral(grey: F64, quad: F64, family: Family, inverted: bool = Fa
     frame = abs(correlation(seen[_frame_mask(modules)], _frame(modules)))
     if not frame >= SCREEN_RATIO:
         return None
-    seen = seen - seen.mean()
-    seen /= max(float(np.linalg.norm(seen)), 1e-9)
-    best: tuple[float, int, float] | None = None
-    for level, blur_px in {_level(blur_px / size_px): blur_px for blur_px in reversed(BLURS_px)}.items():
-        scores = _templates(family, level) @ seen
-        k = int(np.argmax(np.abs(scores) if inverted else scores))
-        if best is None or abs(scores[k]) > best[0]:
-            best = (abs(float(scores[k])), k, blur_px)
-    if best is None or best[0] < SCREEN_CODE_RATIO:
+    best = _likeliest(_unit(seen), family, size_px, inverted)
+    if best[0] < SCREEN_CODE_RATIO:
         return None
     return _refined(grey, H, family, best[1], best[2], inverted)
+
+
+def _likeliest(seen: F64, family: Family, size_px: float, inverted: bool) -> tuple[float, int, float]:
+    """Return correlation, code (id and quarter turns) and blur that fit the samples `seen` (n,) best.
+
+    All codes are compared at one blur, the likeliest of those at the others: blur changes how well a code fits, hardly
+    which.
+    """
+    blurs = list({_level(blur_px / size_px): blur_px for blur_px in reversed(BLURS_px)}.items())
+    middle = blurs.pop(len(blurs) // 2)
+    near = seen.astype(np.float32)
+    scores = _templates(family, middle[0]) @ near
+    sizes = np.abs(scores) if inverted else scores
+    chosen = np.argpartition(sizes, -LIKELY_COUNT)[-LIKELY_COUNT:]
+    best = (abs(float(scores[chosen[-1]])), int(chosen[-1]), middle[1])
+    for level, blur_px in (middle, *blurs):
+        scores = _templates(family, level)[chosen] @ near
+        k = int(np.argmax(np.abs(scores) if inverted else scores))
+        if abs(scores[k]) > best[0]:
+            best = (abs(float(scores[k])), int(chosen[k]), blur_px)
+    return best
 
 
 def _refined(grey: F64, H: F64, family: Family, k: int, blur_px: float, inverted: bool) -> Marker | None:
@@ -228,8 +260,8 @@ def _pictures(family: Family, sigma_modules: float) -> F64:
 
 
 @functools.cache
-def _templates(family: Family, sigma_modules: float) -> F64:
-    return np.apply_along_axis(_unit, 1, _pictures(family, sigma_modules))
+def _templates(family: Family, sigma_modules: float) -> NDArray[np.float32]:
+    return np.apply_along_axis(_unit, 1, _pictures(family, sigma_modules)).astype(np.float32)
 
 
 @functools.cache
@@ -265,15 +297,20 @@ def _quadrilaterals(
 ) -> list[F64]:
     """Return what OpenCV takes for outlines of markers, accepted or not, in pixels of the picture itself.
 
-    The half-sized picture is searched as well: in it grain and noise no longer fray the outline of a pale marker.
+    The half-sized picture is searched as well: in it grain and noise no longer fray the outline of a pale marker. A
+    large picture is halved further: a module wider than OpenCV's windows has no outline for it.
     """
     import cv2
 
     found = []
-    for scale, interpolation in ((float(upscale), cv2.INTER_CUBIC), (0.5, cv2.INTER_AREA)):
+    scales = [float(upscale), 0.5]
+    while max(image.shape) * scales[-1] > ENOUGH_SIDE_PX:
+        scales.append(scales[-1] / 2)
+    for scale in scales:
         if min(image.shape) * scale < smallest_px:
             continue
-        sized = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=interpolation)
+        how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+        sized = image if scale == 1 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how)
         found += [
             (quad + 0.5) / scale - 0.5
             for quad in _outlines(np.ascontiguousarray(sized, dtype=np.uint8), family, inverted, smallest_px)

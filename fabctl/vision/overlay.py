@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from design.pattern.paths import CutPath
+from fabctl.records.folder import write_atomically
 from fabctl.vision.align import Alignment
 from fabctl.vision.inspect import Inspection
+from fabctl.vision.lens import COVERAGE_CELLS, BoardView, covered_cells
 from fabctl.vision.profile import ToPixels
 from fabctl.vision.register import Registration, apply
 from fabctl.vision.template import F64
@@ -86,7 +89,7 @@ STATES: dict[str, Colour] = {
     "missing": (30, 30, 230),
     "not_through": (0, 140, 255),
     "displaced": (220, 60, 220),
-    "unseen": (150, 150, 150),
+    "unseen": (235, 190, 60),
 }
 
 
@@ -99,10 +102,45 @@ def inspection_on_bed(image: Picture, paths: Sequence[CutPath], found: Inspectio
         path = paths[seen.index]
         points = to_pixels(dense(path.points_mm, path.closed))
         polyline(picture, points, STATES[seen.state], width_px=1 if seen.state in ("cut", "unseen") else 3)
-    for k, (state, colour) in enumerate(STATES.items()):
-        count = sum(seen.state == state for seen in found.paths)
-        text = f"{state.replace('_', ' ')}: {count}"
-        cv2.putText(picture, text, (20, 40 + 34 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, 2, cv2.LINE_AA)
+    counts = {state: sum(seen.state == state for seen in found.paths) for state in STATES}
+    rows = [(f"{state.replace('_', ' ')}: {counts[state]}", colour) for state, colour in STATES.items()]
+    return np.asarray(np.vstack([_legend(picture.shape[1], rows), picture]), dtype=np.uint8)
+
+
+def _legend(width_px: int, rows: Sequence[tuple[str, Colour]]) -> Picture:
+    """Return a dark band of that width with each text beside its colour; a band of its own hides no path."""
+    import cv2
+
+    scale = width_px / 1400
+    line, pad = max(20, round(34 * scale)), max(6, round(12 * scale))
+    band: Picture = np.full((line + 2 * pad, width_px, 3), 30, np.uint8)
+    for k, (text, colour) in enumerate(rows):
+        x, middle = round(width_px * k / len(rows)) + pad, line // 2 + pad
+        cv2.line(band, (x, middle), (x + line, middle), colour, max(3, round(6 * scale)), cv2.LINE_AA)
+        place, white = (x + line + pad, middle + round(0.27 * line)), (240, 240, 240)
+        cv2.putText(band, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8 * scale, white, 1, cv2.LINE_AA)
+    return band
+
+
+def coverage_map(views: Sequence[BoardView], size_px: tuple[int, int]) -> Picture:
+    """Return the frame with every corner that a lens is measured by; cells of it that hold none are drawn red."""
+    import cv2
+
+    w, h = size_px
+    picture: Picture = np.full((h, w, 3), 245, np.uint8)
+    covered = covered_cells(views, size_px)
+    columns, rows = COVERAGE_CELLS
+    for c in range(columns):
+        for r in range(rows):
+            low, high = (w * c // columns, h * r // rows), (w * (c + 1) // columns - 1, h * (r + 1) // rows - 1)
+            if (c, r) not in covered:
+                cv2.rectangle(picture, low, high, (170, 170, 250), -1)
+            cv2.rectangle(picture, low, high, (200, 200, 200), 1)
+    radius = max(2, w // 400)
+    for corner in np.vstack([view.corners_px for view in views]) if views else []:
+        cv2.circle(picture, _whole(corner), radius, (140, 90, 20), -1, cv2.LINE_AA)
+    text = f"{len(views)} pictures, {len(covered)} of {columns * rows} cells seen"
+    cv2.putText(picture, text, (20, 40), cv2.FONT_HERSHEY_SIMPLEX, max(0.5, w / 1500), (20, 20, 20), 2, cv2.LINE_AA)
     return picture
 
 
@@ -134,8 +172,9 @@ def _whole(point: F64) -> tuple[int, int]:
 
 
 def write_picture(path: str, picture: Picture) -> None:
-    """Write a picture; raise `OSError` where it cannot be written."""
+    """Write a picture; raise `RecordError` where it cannot be written."""
     import cv2
 
-    if not cv2.imwrite(path, picture):
-        raise OSError(f"{path}: the picture cannot be written")
+    good, data = cv2.imencode(Path(path).suffix, picture)
+    assert good, f"{path}: a picture of shape {picture.shape} does not become bytes"
+    write_atomically(Path(path), data.tobytes())

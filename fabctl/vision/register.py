@@ -6,7 +6,6 @@ refused.
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from design.findings import Finding, errors
 from fabctl.errors import RefusedError, UsageError
+from fabctl.files import json_of, why_not
 from fabctl.records.folder import as_json, write_atomically
 from fabctl.vision.align import Alignment, known_markers, mark_findings
 from fabctl.vision.boards import MarkSheet
@@ -222,8 +222,8 @@ def write_registration(made: Registration, path: Path, **more: Any) -> None:
 
 def read_registration(path: Path) -> Registration:
     """Return the registration in the file; raise `UsageError` where it is none."""
+    data = json_of(path, "a registration of `fabctl camera register`")
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
         if data["format"] != FORMAT:
             raise UsageError(f"{path}: registration format {data['format']}, this tool reads {FORMAT}")
         affine = np.array(data["sheet_to_machine"], dtype=np.float64)
@@ -233,5 +233,7 @@ def read_registration(path: Path) -> Registration:
         rms, worst, height = (float(data[key]) for key in ("rms_mm", "worst_mm", "height_mm"))
         size = (float(w), float(h))
         return Registration(data["sheet"], size, affine, int(data["marks_count"]), rms, worst, height, data["made_utc"])
-    except (OSError, KeyError, TypeError, ValueError) as fault:
-        raise UsageError(f"{path}: not a registration: {fault}; make one with `fabctl camera register`") from fault
+    except (KeyError, TypeError, ValueError) as fault:
+        raise UsageError(
+            f"{path}: not a registration: {why_not(fault)}; make one with `fabctl camera register`"
+        ) from fault

@@ -23,6 +23,7 @@ from scipy.special import ndtr
 F64 = NDArray[np.float64]
 MARGIN_MODULES = 1.0  # how much of the white margin takes part
 PIXEL_SIGMA_PX = 0.29  # a square pixel blurs like a Gaussian of 1/sqrt(12)
+FARTHEST_PX = 1e6
 BLUR_STEP_RATIO = 1.15
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.1, 20.0
 HUBER = 1.5  # residuals beyond this many standard deviations (dust, glare) count less
@@ -199,6 +200,8 @@ def _solve_normal(rows: F64, right: F64) -> F64 | None:
 def _patch(image: F64, H: F64, modules: int) -> tuple[F64, F64]:
     """Return the corner (2,) of the surroundings, and (h, w, 3): grey there, its slope along x, its slope along y."""
     reach = warp(H, CORNERS * (1 + 6 / modules))
+    if not np.abs(reach).max() < FARTHEST_PX:  # a horizon runs through it
+        return np.zeros(2), np.empty((0, 0, 3))
     low = np.maximum(np.floor(reach.min(axis=0)).astype(int) - 2, 0)
     high = np.minimum(np.ceil(reach.max(axis=0)).astype(int) + 3, np.array(image.shape[::-1]))
     if np.any(high - low < 4):

@@ -11,7 +11,7 @@ import shapely
 
 from design.errors import FlattenError
 from design.flatten import Flattening, FlattenOptions, flatten
-from design.flatten.cut import cut_along, shortest_chain
+from design.flatten.cut import chain_through, cut_along, shortest_chain
 from design.flatten.quality import distortion
 from design.flatten.tube import tube, tube_scale_factors
 from design.meshfiles import read_mesh, weld
@@ -160,6 +160,29 @@ def test_a_dart_keeps_both_sides_alike() -> None:
     sides = [np.linalg.norm(np.diff(flat.flat_mm[chain], axis=0), axis=1) for chain in (seam.left, seam.right)]
     np.testing.assert_allclose(*sides, rtol=1e-9)
     assert flat.target_index[seam.left].tolist() == dart.tolist()
+
+
+def test_a_cut_goes_through_the_places_that_are_named() -> None:
+    mesh = double_bump(edge_mm=5)
+    (rim,) = boundary_loops(mesh)
+    places = np.array([[0.0, -200, 0], [10, 0, 0], [30, 5, 0]])
+    chain = chain_through(mesh, places)
+    assert chain[0] in rim and not np.isin(chain[1:], rim).any()
+    nearest = [np.linalg.norm(mesh.vertices_mm - place, axis=1).argmin() for place in places[1:]]
+    assert np.isin(nearest, chain).all() and chain[-1] == nearest[-1]
+    assert len(flatten(mesh, FlattenOptions(cut_path=chain)).seams) == 1
+    tube = cylinder(edge_mm=6)
+    low, high = tube.vertices_mm.min(axis=0), tube.vertices_mm.max(axis=0)
+    seam = chain_through(tube, np.array([[high[0], 0, low[2]], [high[0], 0, high[2] - 1]]))
+    flat = flatten(tube, FlattenOptions(cut_path=seam))
+    assert flat.seams[0].closes_tube
+    assert tube.vertices_mm[seam][:, 0].min() > 0  # on the side that was asked for
+
+
+@pytest.mark.parametrize("places", [[[0, -90, 0], [0, 90, 0]], [[0, -90, 0], [0, -91, 0]]], ids=["across", "nothing"])
+def test_a_cut_that_would_part_the_surface_is_refused(places: list[list[float]]) -> None:
+    with pytest.raises(FlattenError, match="from the rim inwards"):
+        chain_through(cap(edge_mm=10), np.array(places, dtype=float))
 
 
 def test_a_cut_off_the_edges_is_refused() -> None:

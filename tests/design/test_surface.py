@@ -63,6 +63,30 @@ def test_a_flipped_face_is_found_with_its_edges() -> None:
     assert finding.message.startswith("3 edge(s)")
 
 
+def moebius(turns: int = 1, count: int = 40) -> TriMesh:
+    """Return a band of two rows of corners that meets itself after so many half turns."""
+    angle = 2 * np.pi * np.arange(count) / count
+    middle = 40 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    lean = turns * angle / 2
+    across = 8 * np.column_stack([np.cos(lean) * np.cos(angle), np.cos(lean) * np.sin(angle), np.sin(lean)])
+    faces = []
+    for k in range(count):
+        a, b = 2 * k, 2 * k + 1
+        c, d = (a + 2, b + 2) if k < count - 1 else ((1, 0) if turns % 2 else (0, 1))
+        faces += [[a, c, b], [b, c, d]]
+    return TriMesh(np.stack([middle - across, middle + across], axis=1).reshape(-1, 3), np.array(faces))
+
+
+def test_a_band_with_one_side_is_told_from_flipped_faces() -> None:
+    assert codes(moebius(turns=2)) == set()
+    (finding,) = check_target(moebius())
+    assert finding.code == "MESH-ONE-SIDED"
+    assert "cut it across" in finding.hint
+    band = moebius(turns=2)
+    band.faces[7] = band.faces[7, ::-1].copy()
+    assert codes(band) == {"MESH-FLIPPED"}
+
+
 def test_a_closed_surface_is_refused() -> None:
     tube = cylinder()
     vertices_mm = np.vstack([tube.vertices_mm, [[0, 0, 0], [0, 0, 90.0]]])

@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from design.bundle import open_bundle
-from design.errors import UnreadableMesh
-from fabctl.designing import read_inputs
+from design.errors import BundleError, UnreadableMesh
+from fabctl.designing import build_folder, inputs_for, read_inputs
 from fabctl.errors import ConfigError, RefusedError, UsageError
+from fabctl.events import Event
 
 SPEC = """
 name: small-cap
@@ -74,3 +75,32 @@ def test_a_smaller_cell_scales_slit_and_hinge_and_overrides_the_file(tmp_path: P
     assert inputs.spec.cell_mm == inputs.library.sheet.edge_mm == 5.0
     assert inputs.library.sheet.slit_mm == pytest.approx(0.0625)
     assert inputs.spec.hinge.width_mm == pytest.approx(0.125)
+
+
+def test_a_name_that_is_a_specification_is_checked_as_it_would_be_built(tmp_path: Path) -> None:
+    (tmp_path / "configs/specs").mkdir(parents=True)
+    (tmp_path / "configs/specs/mine.yaml").write_text(SPEC.replace("small-cap", "mine") + "cell_mm: 8\n")
+    assert inputs_for("mine", None, tmp_path).spec.cell_mm == 8
+    assert inputs_for("cap", None, tmp_path).spec == read_inputs("cap", tmp_path).spec
+    assert inputs_for("cap", None, tmp_path, cells="contracting").spec.cells == "contracting"
+    with pytest.raises(UsageError, match="says its material and cells itself"):
+        inputs_for("mine", "natural-rubber-2.3", tmp_path)
+
+
+def test_progress_of_a_build_never_goes_back_and_ends_at_all(tmp_path: Path) -> None:
+    (tmp_path / "spec.yaml").write_text(SPEC)
+    told: list[float] = []
+
+    def hear(event: Event) -> None:
+        told.extend([event.done_frac] if event.done_frac is not None else [])
+
+    build_folder(str(tmp_path / "spec.yaml"), tmp_path / "cap", tmp_path, cell_mm=12.0, emit=hear)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_a_folder_that_is_taken_is_refused_before_anything_is_computed(tmp_path: Path) -> None:
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken/notes.txt").write_text("mine")
+    with pytest.raises(BundleError, match="exists already"):
+        build_folder("there is no such specification", tmp_path / "taken", tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,8 +12,11 @@ import numpy as np
 import pytest
 
 from benchmarks._rig_kill import kill_while_loading
+from design.meshfiles import write_ply
+from design.surface import TriMesh
 from fabctl.indent.export import documents, export
-from fabctl.records.folder import open_run
+from fabctl.indent.resume import points_without_contact
+from fabctl.records.folder import open_run, status_of
 from fabctl.testing import SimulatedBench
 from fabctl.workspace import Workspace
 from tests.rig_endpoints import simulated_rig
@@ -74,7 +78,8 @@ def tested(bench: SimulatedBench) -> dict[str, object]:
         "200",
     )
     bench.fabctl("rig", "calibrate", "frame", "--bench", "bench.yaml", "--yes", "--force-N", "4")
-    return bench.fabctl("indent", "run", "S-0001", "--method", "short.yaml", "--bench", "bench.yaml", "--yes")
+    words = ("indent", "run", "S-0001", "--method", "short.yaml", "--bench", "bench.yaml", "--yes")
+    return bench.fabctl(*words, "--batch", "B7", "--rest-h", "24")
 
 
 def test_gain_and_frame_are_calibrated_to_their_true_values(bench: SimulatedBench, tested: dict[str, object]) -> None:
@@ -96,6 +101,9 @@ def test_the_run_keeps_method_calibration_and_conditions(bench: SimulatedBench, 
     assert config["method"]["name"] == "short"
     assert config["calibration"]["gain_ratio"] == pytest.approx(1.02, abs=2e-3)
     assert config["conditions"]["temperature_degC"] == pytest.approx(22.5)
+    assert (config["conditions"]["batch"], config["conditions"]["rest_h"]) == ("B7", 24.0)
+    (told,) = [f for f in config["findings"] if f["code"] == "INDENT-CONDITIONS"]
+    assert told["message"] == "not recorded: thickness_mm"
     assert config["rig"]["firmware"] == "1.04"
 
 
@@ -152,6 +160,49 @@ def test_a_method_beyond_the_limits_is_refused_before_anything_moves(bench: Simu
     before = (bench.lab.root / "truth" / "rig-events.jsonl").read_text()
     bench.fabctl("indent", "run", "S-0001", "--method", "deep.yaml", "--bench", "bench.yaml", "--yes", expect=3)
     assert (bench.lab.root / "truth" / "rig-events.jsonl").read_text() == before
+
+
+GRID = """name: two
+sample_hz: 100
+safe_height_mm: 0.5
+travel_speed_mm_s: 20
+acceleration_mm_s2: 200
+limits: {force_N: 4, tension_N: 1, travel_mm: 40, watchdog_s: 1.0}
+steps:
+  - step: grid
+    x_mm: [X]
+    y_mm: [0]
+    speed_mm_s: 20
+    steps:
+      - {step: tare, time_s: 0.3}
+      - {step: approach, speed_mm_s: 8, trigger_N: 0.01, clearance_mm: 0.8, travel_mm: 12}
+      - {step: cycles, cycles_count: 1, depth_mm: 2.8, speed_mm_s: 2, unload_speed_mm_s: 6}
+"""
+
+
+def test_a_grid_point_beside_the_specimen_is_told_in_the_result_and_the_others_are_measured(
+    bench: SimulatedBench,
+) -> None:
+    design = bench.lab.root / "plate"
+    design.mkdir()
+    shutil.copy(bench.lab.root / "design" / "response.csv", design)
+    corners = np.array([[-20.0, -20, 0], [20, -20, 0], [20, 20, 0], [-20, 20, 0]])
+    write_ply(design / "deployed.ply", TriMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])))
+    specimen = bench.lab.new_specimen(design).name
+    (bench.lab.root / "two.yaml").write_text(GRID.replace("X", "0, 60"))
+    (bench.lab.root / "beside.yaml").write_text(GRID.replace("X", "60").replace("two", "beside"))
+    words = ("indent", "run", specimen, "--bench", "bench.yaml", "--yes", "--method")
+    found = bench.fabctl(*words, "two.yaml")
+    assert found["status"] == "done"
+    assert [(curve["point"], curve["curve"]) for curve in found["curves"]] == [(1, 1)]
+    assert found["stiffness_secant_N_mm"] == pytest.approx(STIFFNESS_N_MM, rel=0.1)
+    (without,) = found["points_without_contact"]
+    assert (without["point"], without["at_mm"]) == (2, [60.0, 0.0])
+    assert "INDENT-POINT-NO-CONTACT" in [finding["code"] for finding in found["findings"]]
+    assert points_without_contact(open_run(bench.lab.runs / str(found["run"]))) == [2]
+    bench.fabctl(*words, "beside.yaml", expect=3)
+    (run,) = [one for one in bench.lab.runs_of(specimen, "indent") if one.run_id != found["run"]]
+    assert status_of(run) == "failed"
 
 
 def test_a_killed_host_leaves_a_stage_that_stops_and_every_acknowledged_row(tmp_path: Path) -> None:

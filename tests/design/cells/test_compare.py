@@ -24,6 +24,34 @@ def test_columns_may_stand_in_any_order_and_case_among_others() -> None:
     assert plain.t_mm[0] == pytest.approx(1.2)
 
 
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_headings_may_carry_units_and_cells_other_marks(mark: str) -> None:
+    plain = read_published(f"{HEADER}\n0.12,0.05,1.6,20,300\n", SHEET)
+    names = ["t_over_l0 (-)", "theta_rad [rad]", "expansion_ratio [1]", "energy_barrier (a.u.)", "stiffness (N/m, old)"]
+    quoted = [f'"{name}"' for name in names]
+    rows = [mark.join(quoted), mark.join(["0.12", "0.05", "1.6", "20", "300"])]
+    assert read_published("\r\n".join(rows), SHEET) == plain
+
+
+def test_an_angle_in_degrees_is_refused() -> None:
+    with pytest.raises(TableError, match="theta_rad is in deg, not rad"):
+        read_published(f"{HEADER.replace('theta_rad', 'theta_rad [deg]')}\n0.12,3,1.6,20,300\n", SHEET)
+
+
+def test_the_order_of_the_rows_changes_nothing() -> None:
+    """Each column is walked along t, whatever order its rows stand in."""
+    library = load_library()
+    rows = [
+        f"{library.t_mm[k] / 10!r},{library.theta_rad[k]!r},{library.expansion_ratio[k]!r},1,1" for k in range(500, 530)
+    ]
+    mixed = [rows[k] for k in np.random.default_rng(4).permutation(len(rows))]
+    plain, other = (
+        {(c.t_mm, c.theta_rad): c for c in solve_rows(read_published("\n".join([HEADER, *lines]), SHEET), SHEET)}
+        for lines in (rows, mixed)
+    )
+    assert plain == other and len(plain) == 30
+
+
 def test_all_missing_columns_are_told_at_once() -> None:
     with pytest.raises(TableError) as refused:
         read_published("t_over_l0,theta_rad,theta_rad\n1,2,3\n", SHEET)

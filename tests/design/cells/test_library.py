@@ -10,9 +10,10 @@ import pytest
 
 from design.cells.geometry import strip_mm
 from design.cells.homogenise import even_curve_mm2, solve_pair
-from design.cells.library import CellLibrary, LibraryError, load_library
+from design.cells.library import SHIPPED, SHIPPED_OPEN, CellLibrary, LibraryError, load_library
 from design.cells.mesh import REFERENCE
 from design.cells.sheet import Sheet
+from design.cells.sweep import Kind, plan_of
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,20 @@ def test_every_candidate_of_the_paper_is_decided(library: CellLibrary) -> None:
     assert sum(counts.values()) == 7552
     assert counts["invalid"] == counts["not converged"] == 0
     assert sum(library.reasons().values()) == counts["not bistable"]
+
+
+@pytest.mark.parametrize(("path", "kind"), [(SHIPPED, "slit"), (SHIPPED_OPEN, "open")])
+def test_the_shipped_files_are_those_of_the_solver_beside_them(path: Path, kind: Kind) -> None:
+    library = load_library(path)
+    plan = plan_of(library.sheet, t_step_mm=library.meta["plan"]["t_step_mm"], kind=kind)
+    assert library.hash == plan.key(), "the solver's text has changed: build both anew (docs/cells.md, Shipped files)"
+
+
+def test_every_candidate_with_a_second_state_counts(library: CellLibrary) -> None:
+    t_mm, theta_rad = library.shallow_cells()
+    assert len(t_mm) == 28 and not any("shallow" in reason for reason in library.reasons())
+    cells = library.at(t_mm, theta_rad)
+    assert cells.inside.all() and (cells.barrier_mJ > 0).all()
 
 
 def test_the_range_is_the_published_one(library: CellLibrary) -> None:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from design.cells import kernels
+from design.cells import homogenise, kernels
 from design.cells.elements import THREE_POINTS, gradients
-from design.cells.homogenise import Pair, solve_cell, solve_pair
+from design.cells.homogenise import Failure, Pair, is_shallow, solve_cell, solve_pair
 from design.cells.mesh import REFERENCE, topology
 from design.cells.periodic import (
     derivatives,
@@ -340,3 +340,32 @@ def test_a_thin_hinge_that_snaps_into_a_shallow_well_is_found_in_the_deep_one() 
     for name, share in (("expansion_ratio", 1e-5), ("stored_mm2", 1e-3)):
         values = np.array([getattr(cell, name) for cell in cells])
         assert values == pytest.approx(np.polyval(np.polyfit(t_mm, values, 1), t_mm), rel=share)
+
+
+SHALLOW = (2.7777280, math.radians(-20))  # the candidate of the paper's sheet nearest to the fold, in mm and radians
+
+
+def test_a_well_too_shallow_for_the_mesh_is_decided_on_a_finer_one() -> None:
+    found = solve_pair(*SHALLOW, SHEET, REFERENCE)
+    assert isinstance(found, tuple) and is_shallow(found[1])
+    cell = solve_cell(*SHALLOW, SHEET)
+    finer = solve_pair(*SHALLOW, SHEET, REFERENCE.refined(2))
+    assert isinstance(finer, tuple)
+    assert (cell.verdict, cell.mesh_ratio) == ("bistable", 0.5)
+    assert cell.expansion_ratio == finer[1].stable.s_ratio
+    assert solve_cell(1.2, 0.0, SHEET).mesh_ratio == 1.0
+
+
+def test_the_finer_mesh_may_also_decide_against_a_shallow_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    none = Failure("not bistable", "dE/ds keeps rising")
+    coarse = solve_pair(*SHALLOW, SHEET, REFERENCE)
+    monkeypatch.setattr(homogenise, "solve_pair", lambda *words: coarse if REFERENCE in words else none)
+    cell = solve_cell(*SHALLOW, SHEET)
+    assert cell.verdict == "not bistable" and "half the mesh size" in cell.reason and cell.expansion_ratio is None
+
+
+def test_a_shallow_well_has_settled_at_half_the_mesh_size() -> None:
+    coarse, half, third = (solve_pair(*SHALLOW, SHEET, REFERENCE.refined(k)) for k in (1, 2, 3))
+    assert isinstance(coarse, tuple) and isinstance(half, tuple) and isinstance(third, tuple)
+    s = [found[1].stable.s_ratio for found in (coarse, half, third)]
+    assert abs(s[2] - s[1]) < 0.003 < 0.008 < s[1] - s[0]

@@ -66,6 +66,8 @@ def test_an_even_sheet_ends_flat_and_expanded(lattice, cell) -> None:
     found = cascade(layout, wells)
     assert found.is_open.all()
     assert found.stable
+    assert found.smallest_eigenvalue_N_mm > 0
+    assert found.iterations_count > 0
     assert found.residual_ratio < 1e-8
     spread = np.linalg.svd(found.x_mm - found.x_mm.mean(axis=0), compute_uv=False)
     assert spread[2] < 1e-3 * spread[0]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from design.deploy.compensate import compensate, force_derivative
+from design.cells.sheet import Sheet
+from design.deploy.compensate import compensate, force_derivative, misfit_mm
 from design.deploy.equilibrium import solve_level
 from design.deploy.newton import System
+from design.deploy.standing import standing
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +41,31 @@ def test_a_compensated_cap_meets_its_sphere(cap) -> None:
     assert found.equilibrium.stable
     again = solve_level(found.layout, cap.design_mm)
     assert again.energy_mJ == pytest.approx(found.equilibrium.energy_mJ, rel=1e-6)
+
+
+@pytest.mark.parametrize("support", ["held", "no-slip", "slip", "coulomb"])
+def test_a_cap_that_bears_its_weight_is_brought_nearer_to_its_sphere(cap, support) -> None:
+    sheet = Sheet(density_kg_m3=2_000.0)
+    held = standing(cap.layout, cap.design_mm, sheet, support)
+    free = solve_level(cap.layout, cap.design_mm)
+    loaded = solve_level(cap.layout, cap.design_mm, held.loads, held.fixed)
+    assert abs(loaded.x_mm - free.x_mm).max() > 0.05
+    found = compensate(cap.layout, cap.design_mm, (1.0, 1.9), standing=held)
+    assert found.helps
+    assert found.before_mm == pytest.approx(misfit_mm(loaded.x_mm, cap.design_mm, held))
+    assert found.after_mm < found.before_mm / 3
+    again = solve_level(found.layout, cap.design_mm, held.loads, held.fixed)
+    assert misfit_mm(again.x_mm, cap.design_mm, held) == pytest.approx(found.after_mm, rel=1e-3)
+
+
+def test_a_held_rim_does_not_move_and_the_rest_of_the_misfit_counts_where_it_stands(cap) -> None:
+    held = standing(cap.layout, cap.design_mm, Sheet(), "held")
+    rest = solve_level(cap.layout, cap.design_mm, held.loads, held.fixed)
+    assert held.fixed is not None
+    assert np.all(rest.x_mm[held.fixed] == cap.design_mm[held.fixed])
+    assert misfit_mm(rest.x_mm + np.eye(3)[0], rest.x_mm, held) == pytest.approx(1.0)
+    free = standing(cap.layout, cap.design_mm, Sheet(), "free")
+    assert misfit_mm(rest.x_mm + np.eye(3)[0], rest.x_mm, free) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_expansions_stay_within_the_library(cap) -> None:

@@ -72,6 +72,17 @@ def test_a_coarser_sheet_covers_the_finer_one(cap_of) -> None:
     )
 
 
+def test_a_finer_sheet_starts_on_the_curved_surface_not_on_its_facets(cap_of) -> None:
+    away = []
+    for edge_mm in (5.0, 2.5):
+        coarse, fine = cap_of(edge_mm=2 * edge_mm), cap_of(edge_mm=edge_mm)
+        start = prolong(coarse.layout, coarse.design_mm, fine.layout)
+        inside = np.linalg.norm(fine.layout.flat_mm(), axis=1) < 40
+        away.append(np.abs(np.linalg.norm(start[inside], axis=1) - 80).max())
+    assert away[0] < 0.1  # facets of 15 mm lie 0.35 mm within the sphere
+    assert np.log2(away[0] / away[1]) > 2.5  # facets would give 2
+
+
 def test_dividing_units_keeps_the_sheet_and_its_mean_expansion(cap) -> None:
     fine = refine(cap.layout, 3)
     lam = fine.expansion_ratio.reshape(-1, 9)
@@ -95,6 +106,9 @@ def test_a_pressed_cap_pushes_back_and_recovers(cap, popped) -> None:
     assert np.all(np.diff(response.load_N) > 0)
     assert response.residual_ratio < 1e-8
     assert response.recovered_mm < 1e-6
+    assert response.iterations_count > 8
+    assert response.unstable_count == 0
+    assert response.smallest_eigenvalue_N_mm > 0
     assert response.unload_N == pytest.approx(response.load_N, abs=1e-6)
     stiffer = cap.layout.__class__(
         **{**{f: getattr(cap.layout, f) for f in cap.layout.__slots__}, "D_mJ": 4 * cap.layout.D_mJ}

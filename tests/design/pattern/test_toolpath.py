@@ -8,6 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks._travel_bound import bound_mm
 from design.errors import DesignError
 from design.pattern.order import floor_mm, greedy_with_flips, tour, travel_mm
 from design.pattern.paths import CutPath
@@ -78,6 +79,30 @@ def test_two_sides_need_a_beam_finer_than_the_slit() -> None:
         strokes_of([CutPath("slit", SQUARE_mm[:3])], ToolOptions(KERF_mm, slit_width_mm=0.1, slit_sides="both"))
 
 
+def test_a_slit_that_bends_close_to_its_end_is_shortened_round_the_bend() -> None:
+    line = np.array([[0.0, 0.0], [0.04, 0.0], [0.04, 5.0]])
+    (stroke,) = strokes_of([CutPath("slit", line)], ToolOptions(KERF_mm))
+    assert stroke.points_mm == pytest.approx(np.array([[0.04, 0.06], [0.04, 4.9]]))
+
+
+@pytest.mark.parametrize("loop_mm", [SQUARE_mm[::-1] * [1, 0.02], SQUARE_mm[::-1] * 0.01])
+def test_a_lead_in_never_burns_the_other_side_of_a_narrow_opening(loop_mm: np.ndarray) -> None:
+    path = CutPath("hole", loop_mm, closed=True)
+    void = shapely.Polygon(loop_mm).buffer(1e-6)
+    assert burnt(strokes_of([path], ToolOptions(KERF_mm, lead_in_mm=1.0, overcut_mm=0.3))).within(void)
+
+
+def test_a_lead_in_begins_where_there_is_room_beside_the_piece() -> None:
+    tag = shapely.box(0, 0, 40, 10).union(shapely.box(18, 10, 22, 11)).union(shapely.box(0, 11, 40, 30))  # a 1 mm gap
+    loop_mm = np.asarray(tag.exterior.coords)[:-1]
+    loop_mm = loop_mm if signed_area_mm2(loop_mm) > 0 else loop_mm[::-1]
+    for first in range(len(loop_mm)):
+        path = CutPath("outline", np.roll(loop_mm, first, axis=0), closed=True)
+        (stroke,) = strokes_of([path], ToolOptions(KERF_mm, lead_in_mm=1.5))
+        assert np.linalg.norm(stroke.points_mm[1] - stroke.points_mm[0]) == pytest.approx(1.5)
+        assert burnt([stroke]).intersection(tag).area < 1e-4
+
+
 def test_the_lead_in_starts_in_the_waste_and_the_overcut_passes_the_start() -> None:
     options = ToolOptions(KERF_mm, lead_in_mm=1.5, overcut_mm=0.8)
     for loop, layer in ((SQUARE_mm, "outline"), (SQUARE_mm[::-1], "outline"), (SQUARE_mm, "hole")):
@@ -140,11 +165,28 @@ def test_the_tour_is_the_shortest_of_all_on_a_few_strokes() -> None:
     assert length(tour(ends).tolist()) == pytest.approx(min(map(length, everything)))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_no_order_travels_less_than_the_bound(seed: int) -> None:
+    ends = np.random.default_rng(seed).uniform(0, 50, (400, 2))
+    found = travel_mm(ends, tour(ends))
+    bound = bound_mm(ends, found)
+    assert floor_mm(ends) < bound <= found
+    assert bound > 0.85 * found  # the floor is at 0.8
+
+
 def test_travel_is_a_quarter_shorter_than_greedy() -> None:
     ends = random_ends(3000, 1)
     ratio = travel_mm(ends, tour(ends)) / travel_mm(ends, greedy_with_flips(ends))
     assert ratio <= 0.75
     assert travel_mm(ends, tour(ends)) >= floor_mm(ends)
+
+
+def test_rings_that_an_exchange_closes_are_opened_again_where_that_pays() -> None:
+    rng = np.random.default_rng(2)
+    start, angle = rng.uniform(0, 105, (2000, 2)), rng.uniform(0, 2 * np.pi, 2000)
+    ends = np.stack([start, start + np.column_stack([np.cos(angle), np.sin(angle)])], axis=1).reshape(-1, 2)
+    ratio = travel_mm(ends, tour(ends, kicks_count=0)) / travel_mm(ends, greedy_with_flips(ends))
+    assert ratio <= 0.76  # 0.771 by exchanges that close no ring
 
 
 def test_layers_come_in_order_and_the_inner_contour_before_the_outer() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from design.cells.hinges import cells_as_cut
 from design.errors import BundleError
 from design.meshfiles import read_mesh
 from fabctl.cli.deploy import command
-from fabctl.deploying import read_laid, wells_of
+from fabctl.deploying import divided, read_laid, wells_of
 from fabctl.designing import build_compensated, build_folder, design_of, read_inputs
 from fabctl.errors import RefusedError
 
@@ -28,6 +29,10 @@ def folder(tmp_path_factory) -> Path:
 
 def test_a_design_folder_gives_back_the_shell_it_was_built_with(folder: Path) -> None:
     laid = read_laid(folder, folder.parent)
+    facts = open_bundle(folder).manifest["facts"]
+    assert facts["residual_ratio"] < 1e-8
+    assert facts["response_residual_ratio"] < 1e-8
+    assert facts["smallest_eigenvalue_N_mm"] > 0 == facts["response_unstable_count"]
     assert laid.layout.edge_mm == pytest.approx(20.0, abs=1e-4)
     assert laid.design_mm is not None
     assert np.linalg.norm(laid.start_mm - laid.design_mm, axis=1).mean() < 4.0
@@ -94,6 +99,66 @@ def test_a_compensated_folder_is_nearer_to_its_target_and_says_so(tmp_path: Path
     )
     with pytest.raises(BundleError, match="exists already"):
         build_compensated(open_bundle(tmp_path / "x"), folder, tmp_path)
+
+
+def test_a_sheet_is_compensated_under_its_weight_on_its_rim(tmp_path: Path) -> None:
+    text = "name: x\ntarget: {make: cap, radius_mm: 60, edge_mm: 5}\nresponse: {steps_count: 4, depth_mm: 2}\n"
+    (tmp_path / "x.yaml").write_text(text)
+    build_folder(str(tmp_path / "x.yaml"), tmp_path / "x", tmp_path)
+    words = [str(tmp_path / "x"), "--gravity", "--support", "held", "--compensate", "--no-animation", "--json"]
+    ran = CliRunner().invoke(command, words, obj=str(tmp_path), catch_exceptions=False)
+    assert ran.exit_code == 0, ran.output
+    told = json.loads(ran.stdout)["compensated"]["told"]
+    before_mm, after_mm = (float(number) for number in re.findall(r"([\d.]+) mm", told)[:2])
+    assert told.startswith("under its weight, rim held: ")
+    assert after_mm < before_mm / 3
+    assert "compensate: held" in (tmp_path / "x-compensated" / "spec.yaml").read_text()
+
+
+def test_units_may_be_divided_into_several_triangles(folder: Path) -> None:
+    laid = read_laid(folder, folder.parent)
+    fine = divided(laid, 2)
+    assert len(fine.layout.cells) == 4 * len(laid.layout.cells)
+    assert fine.design_mm is not None
+    assert fine.design_mm[: len(laid.start_mm)] == pytest.approx(laid.design_mm, abs=1e-5)  # cells.csv is rounded
+    words = [str(folder), "--parts", "2", "--no-animation", "--json", "-o", str(folder.parent / "fine")]
+    ran = CliRunner().invoke(command, words, obj=str(folder.parent), catch_exceptions=False)
+    told = json.loads(ran.stdout)
+    assert told["units_count"] == len(laid.layout.cells)
+    assert told["triangles_count"] == 4 * told["units_count"]
+    assert told["residual_ratio"] < 1e-8
+    refused = CliRunner().invoke(command, [*words, "--cascade"], obj=str(folder.parent))
+    assert refused.exit_code == 2
+
+
+def test_a_vase_with_its_seam_joined_is_deployed_and_stands_on_its_foot(tmp_path: Path) -> None:
+    text = "name: v\ntarget: {make: vase, radius_mm: 30, height_mm: 80}\ncell_mm: 14\n"
+    (tmp_path / "v.yaml").write_text(text + "response: {steps_count: 4, depth_mm: 1}\n")
+    design, _ = build_folder(str(tmp_path / "v.yaml"), tmp_path / "v", tmp_path)
+    assert design.predicted is not None
+    laid = read_laid(tmp_path / "v", tmp_path)
+    assert laid.layout.rejoined_count() > 3
+    assert laid.design_mm is not None
+    assert np.linalg.norm(laid.start_mm - laid.design_mm, axis=1).max() < 6.0
+    words = [
+        str(tmp_path / "v"),
+        "--gravity",
+        "--support",
+        "no-slip",
+        "--no-animation",
+        "--json",
+        "-o",
+        str(tmp_path / "popped"),
+    ]
+    ran = CliRunner().invoke(command, words, obj=str(tmp_path), catch_exceptions=False)
+    told = json.loads(ran.stdout)
+    assert told["energy_mJ"] == pytest.approx(design.predicted.deployed.equilibrium.energy_mJ, rel=1e-3)
+    assert 0 < told["standing_count"] < laid.layout.rejoined_count() * 4
+    assert 0 < told["sag_mm"] < 5
+    with pytest.raises(RefusedError) as refused:
+        wells_of(laid)
+    assert [finding.code for finding in refused.value.findings] == ["CASCADE-SEAM"]
+    assert design.predicted.response.stiffness_N_mm(1.0) < 1.0  # the lip gives way, only the foot is held
 
 
 def test_a_sheet_that_compensation_does_not_help_is_refused(tmp_path: Path, monkeypatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -101,4 +102,24 @@ def test_a_second_interrupt_on_the_way_out_changes_no_exit_code(name: str, early
         [sys.executable, "-c", WAY_OUT.format(name=name, early=early)], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == OPERATOR, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_terminal_without_greek_letters_ends_no_command() -> None:
+    script = (
+        "import sys, click; from fabctl.cli import main; sys.argv = ['fabctl']\n"
+        "main.cli = click.Command('x', callback=lambda: click.echo('θ')); main.main()"
+    )
+    line = [sys.executable, "-c", script]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "latin-1"})
+    assert done.returncode == DONE, done.stderr
+    assert done.stdout == b"\\u03b8\n"
+
+
+def test_a_full_disk_behind_stdout_is_the_disks_fault() -> None:
+    with Path("/dev/full").open("w") as full:
+        line = [sys.executable, "-m", "fabctl", "target", "list", "--json"]
+        done = subprocess.run(line, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == DEVICE
+    assert "no space left" in done.stderr
     assert "Traceback" not in done.stderr

@@ -21,11 +21,17 @@ STARTS: dict[str, Callable[[Reals], Reals]] = {
 
 
 def curve(
-    start: Callable[[Reals], Reals], seed: int, noise_N: float = 0.01, contact_mm: float = 7.3
+    start: Callable[[Reals], Reals],
+    seed: int,
+    noise_N: float = 0.01,
+    contact_mm: float = 7.3,
+    drift_N_mm: float = 3e-4,
+    free_mm: float = 1.0,
+    apart_mm: float = 0.01,
 ) -> tuple[Reals, Reals]:
     rng = np.random.default_rng(seed)
-    depth = np.arange(-1.0, 6.0, 0.01)
-    force = start(np.maximum(depth, 0.0)) + rng.normal(0, noise_N, len(depth)) + 3e-4 * (depth + 1)
+    depth = np.arange(-free_mm, 6.0, apart_mm)
+    force = start(np.maximum(depth, 0.0)) + rng.normal(0, noise_N, len(depth)) + drift_N_mm * (depth + free_mm)
     return depth + contact_mm, force
 
 
@@ -78,3 +84,58 @@ def test_a_start_too_soft_for_the_noise_is_not_found() -> None:
     found = find_contact(*curve(lambda d: 0.004 * d, 2))
     assert found.position_mm is None
     assert found.reason
+
+
+@pytest.mark.parametrize("drift_N_mm", [-0.03, 0.03, 0.1])
+@pytest.mark.parametrize("name", sorted(STARTS))
+def test_a_sharp_drift_before_contact_is_not_taken_for_the_specimen(name: str, drift_N_mm: float) -> None:
+    found = [find_contact(*curve(STARTS[name], seed, drift_N_mm=drift_N_mm, free_mm=2.0)) for seed in range(3)]
+    off_mm = [abs((one.position_mm or 0.0) - 7.3) for one in found]
+    assert max(off_mm) < (0.15 if name == "Hertzian" else 0.03)
+    assert [one.drift_N_mm for one in found] == pytest.approx([drift_N_mm] * 3, abs=0.012)
+
+
+def test_no_drift_is_told_where_there_is_none() -> None:
+    told = [find_contact(*curve(STARTS["softening"], seed, drift_N_mm=0.0)).drift_N_mm for seed in range(20)]
+    assert sum(drift_N_mm != 0 for drift_N_mm in told) <= 3
+
+
+def test_a_drift_as_steep_as_the_specimen_is_no_free_part() -> None:
+    found = find_contact(*curve(lambda d: 0.05 * d + 0.02 * d**2, 1, drift_N_mm=0.1, noise_N=0.002))
+    assert found.position_mm is None
+    assert "drifts too much" in found.reason
+
+
+@pytest.mark.parametrize("name", sorted(STARTS))
+def test_samples_that_lie_far_apart_still_show_the_contact(name: str) -> None:
+    found = [find_contact(*curve(STARTS[name], seed, free_mm=2.0, apart_mm=0.15)) for seed in range(4)]
+    for one in found:
+        assert one.position_mm is not None
+        assert abs(one.position_mm - 7.3) < max(0.05, 3.5 * (one.se_mm or 0))
+
+
+def test_too_few_samples_before_contact_are_told_as_such() -> None:
+    found = find_contact(*curve(STARTS["softening"], 1, free_mm=1.2, apart_mm=0.15))
+    assert found.position_mm is None
+    assert "samples" in found.reason
+    assert "lie before the rise, 12 are needed" in found.reason
+
+
+def test_a_start_that_pulls_is_none() -> None:
+    """Where noise dips before contact, a fit with a negative first slope would be early by 0.2 mm."""
+    found = [find_contact(*curve(lambda d: 0.47 * d - 0.04 * d**2, seed)).position_mm for seed in range(40)]
+    assert max(abs((at or 0.0) - 7.3) for at in found) < 0.06
+
+
+@pytest.mark.parametrize("name", ["softening", "straight"])
+def test_a_load_cell_behind_a_filter_errs_slowly_and_is_believed_less(name: str) -> None:
+    found = []
+    for seed in range(6):
+        position, force = curve(STARTS[name], seed, noise_N=0.0, free_mm=1.5)
+        noise = np.zeros(len(force))
+        for k, kick in enumerate(np.random.default_rng(seed).normal(0, 0.006, len(force))):
+            noise[k] = 0.8 * noise[k - 1] + kick
+        found.append(find_contact(position, force + noise))
+    off_mm = [abs((one.position_mm or 0.0) - 7.3) for one in found]
+    assert max(off_mm) < 0.05
+    assert min(one.se_mm or 0.0 for one in found) > 0.006

@@ -12,7 +12,7 @@ from fabctl.config.loader import parse
 from fabctl.config.method import MethodConfig, load_method
 from fabctl.errors import ConfigError
 from fabctl.indent.method import Predicted, actions, check
-from fabctl.indent.run import resumed
+from fabctl.indent.resume import resumed
 
 RIG = RigConfig(url="x", map="reference", travel_mm=60.0, force_limit_N=20.0, indenter_radius_mm=8.0)
 NOWHERE = Path("nowhere")
@@ -59,6 +59,7 @@ def test_what_is_left_after_an_interruption_begins_with_a_tare() -> None:
     assert dome[0].kind == "tare"
     assert [a.curve for a in dome if a.kind == "load"] == [4]
     assert resumed(plan, [(point, 1) for point in range(1, 10)]) == ()
+    assert {a.point for a in resumed(plan, [(1, 1)], untouched=[2, 5])} == {3, 4, 6, 7, 8, 9}
 
 
 def test_a_load_without_an_approach_is_refused() -> None:
@@ -68,6 +69,22 @@ def test_a_load_without_an_approach_is_refused() -> None:
 
 def test_an_approach_without_a_tare_is_refused() -> None:
     assert "METHOD-TARE" in codes(method("  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"))
+
+
+def test_a_preload_without_a_zero_after_it_is_told() -> None:
+    begin = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"
+    preload = "  - {step: preload, force_N: 0.2, speed_mm_s: 1}\n"
+    load = "  - {step: load, depth_mm: 2, speed_mm_s: 1}\n"
+    assert "METHOD-PRELOAD" in codes(method(begin + preload + load))
+    assert "METHOD-PRELOAD" not in codes(method(begin + preload + "  - {step: zero}\n" + load))
+
+
+def test_a_tare_while_the_specimen_is_pressed_is_refused() -> None:
+    begin = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"
+    load, tare = "  - {step: load, depth_mm: 2, speed_mm_s: 1}\n", "  - {step: tare}\n"
+    for way_out, refused in (("", True), ("force_N: 0.1, ", True), (None, False)):
+        unload = "" if way_out == "" else f"  - {{step: unload, {way_out or ''}speed_mm_s: 1}}\n"
+        assert ("METHOD-TARE-PRESSED" in codes(method(begin + load + unload + tare))) == refused
 
 
 def test_a_predicted_force_above_the_limit_is_refused() -> None:

@@ -11,15 +11,17 @@ from benchmarks._rig_memory import REGISTERS, Kept, MemoryBus, method
 from drivers.errors import DeviceTimeout
 from drivers.rig.indenter import Indenter, RigFaulted
 from drivers.rig.samples import Sample
+from fabctl.config.loader import parse
 from fabctl.config.method import MethodConfig
 from fabctl.errors import RefusedError, Stopped
 from fabctl.events import Event
 from fabctl.indent.method import actions
-from fabctl.indent.run import ForceOffZero, NoContact, Runner, Wish, left_behind
+from fabctl.indent.run import ForceOffZero, NoContact, Runner, left_behind
+from fabctl.indent.sampling import TimeLeft, Wish
 from simulators.rig import registers as R
 from simulators.rig.controller import Controller, Machine
 from simulators.specimens.analytic import linear, softening
-from simulators.specimens.curve import Curves, Specimen
+from simulators.specimens.curve import Curves, Place, Specimen
 
 QUIET = Machine(noise_N=0.001, contact_mm=2.0, parked_mm=0.2, backlash_mm=0.0)
 
@@ -108,7 +110,7 @@ def test_a_pause_asked_for_while_the_stage_stands_lets_no_motion_begin() -> None
     asked: list[int] = []
 
     def wish(bench: Bench) -> Wish:
-        during_the_tare = bench.runner._action.kind == "tare"
+        during_the_tare = bench.runner.sampler.action.kind == "tare"
         if during_the_tare or (asked and len(asked) < 80):
             asked.append(bench.device.tick_count)
             return "pause"
@@ -136,6 +138,92 @@ def test_no_specimen_is_no_contact() -> None:
     with pytest.raises(NoContact, match="did not rise"):
         bench.runner.execute()
     assert left_standing(bench)
+
+
+GRID = """
+name: grid
+safe_height_mm: 0.5
+travel_speed_mm_s: 20
+acceleration_mm_s2: 200
+limits: {force_N: 20, travel_mm: 40}
+steps:
+  - step: grid
+    x_mm: [-15, 0, 15]
+    y_mm: [0]
+    steps:
+      - {step: tare, time_s: 0.3}
+      - {step: approach, speed_mm_s: 6, trigger_N: 0.06, clearance_mm: 1, travel_mm: 6}
+      - {step: cycles, cycles_count: 1, depth_mm: 2, speed_mm_s: 2}
+"""
+
+
+def beside_the_middle(x_mm: float, _y_mm: float) -> Place | None:
+    """A specimen with a hole in the middle of the grid."""
+    return None if x_mm == 0 else Place(0.0, 1.0)
+
+
+def test_a_grid_point_without_contact_is_noted_and_the_next_one_gone_to_by_the_safe_height() -> None:
+    bench = Bench(linear(0.5), parse(GRID, MethodConfig, "grid.yaml"))
+    bench.device.place = beside_the_middle
+    ending = bench.runner.execute()
+    assert ending.curves_done == [(1, 1), (3, 1)]
+    assert set(ending.contacts_mm) == {1, 3}
+    assert list(ending.no_contact) == [2]
+    assert "did not rise by 0.06 N" in ending.no_contact[2]
+    stages = [facts for kind, facts in bench.told if kind == "command" and facts["code"] == R.MOVE_STAGE]
+    assert [facts["reason"] for facts in stages] == [R.NO_REASON] * 3  # the controller refuses one from below
+    assert [e.data["point"] for e in bench.events if e.kind == "no_contact"] == [2]
+    assert any("point 2: no contact" in e.message for e in bench.events if e.kind == "warning")
+    assert len(ending.tares_N) == 3
+    assert {row.curve for row in bench.kept.rows if row.point == 2} == {0}
+
+
+def test_a_grid_point_that_ends_in_a_latched_fault_ends_the_run() -> None:
+    def press_the_button(at: Bench) -> Wish:
+        at.device.estop_open |= at.device.stage_mm[0] == 0 and at.device.axis.position_mm > 4
+        return "go"
+
+    bench = Bench(linear(0.5), parse(GRID, MethodConfig, "grid.yaml"), wish=press_the_button)
+    bench.device.place = beside_the_middle
+    with pytest.raises(RigFaulted, match="estop"):
+        bench.runner.execute()
+    assert bench.runner.ending.no_contact == {}
+    bench.device.advance(100)  # it brakes
+    assert left_standing(bench)
+
+
+def test_the_time_left_stands_still_while_the_operator_holds_it_up() -> None:
+    left = TimeLeft([10.0, 20.0, 5.0], 0.0)
+    left.begin(1, 12.0)
+    assert left.left_s(15.0) == pytest.approx(22.0)
+    left.hold(16.0)
+    assert left.left_s(90.0) == pytest.approx(21.0)
+    left.go_on(100.0)
+    assert left.left_s(101.0) == pytest.approx(20.0)
+    # An action that takes longer than was thought takes nothing from those to come.
+    assert left.left_s(1000.0) == pytest.approx(5.0)
+    assert left.done_frac(1000.0) == pytest.approx(30 / 35)
+
+
+def test_a_pause_is_shown_with_the_time_that_is_left_after_it() -> None:
+    asked: list[int] = []
+
+    def wish(bench: Bench) -> Wish:
+        if bench.device.depth_mm > 1.0 and len(asked) < 300:
+            asked.append(1)
+            return "pause"
+        return "go"
+
+    bench = Bench(linear(0.5), method(3.0, 1.0), wish=wish)
+    bench.runner.execute()
+    shown = [e for e in bench.events if e.kind == "progress"]
+    paused = [e.message for e in shown if e.data["step"] == "paused"]
+    assert len(paused) > 10
+    assert len({message.split()[-3] for message in paused}) == 1
+    assert shown[-1].done_frac is not None
+    assert 0.95 < shown[-1].done_frac < 1
+    fractions = [e.done_frac for e in shown if e.done_frac is not None]
+    assert fractions == sorted(fractions)
 
 
 def test_a_cell_far_off_zero_is_refused_before_the_approach() -> None:

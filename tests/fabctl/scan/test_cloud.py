@@ -137,6 +137,99 @@ def test_colours_and_normals_of_a_text_file_are_known_by_their_range(tmp_path: P
     assert np.allclose(found.colours, np.round(colours / gain * 255), atol=1)
 
 
+@pytest.mark.parametrize(
+    ("header", "order"),
+    [
+        ("z,x,y,intensity,ny,nz,nx,b,g,r", "zxyinnnbgr"),
+        ('"Points:2";"Points:0";"Points:1";"Blue";"Red";"Green"', "zxybrg"),
+        ("//R G B X Y Z", "rgbxyz"),
+        ("# y [mm]\tz [mm]\tx [mm]", "yzx"),
+        ("id time x_mm y_mm z_mm red green blue", "iixyzrgb"),
+    ],
+)
+def test_columns_named_in_a_header_are_taken_by_their_names(tmp_path: Path, header: str, order: str) -> None:
+    normals = POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)
+    seen = np.random.default_rng(1).integers(0, 256, (len(POINTS), 3))
+    turned = iter((1, 2, 0))
+    of = {"x": POINTS[:, 0], "y": POINTS[:, 1], "z": POINTS[:, 2], "i": np.arange(len(POINTS))}
+    of |= {"r": seen[:, 0], "g": seen[:, 1], "b": seen[:, 2]}
+    table = np.column_stack([normals[:, next(turned)] if c == "n" else of[c] for c in order])
+    mark = next((m for m in ";,\t" if m in header), " ")
+    np.savetxt(tmp_path / "cloud.csv", table, delimiter=mark, header=header, comments="", fmt="%.6f")
+    found = read_cloud(tmp_path / "cloud.csv")
+    assert np.allclose(found.points, POINTS)
+    assert "SCAN-COLUMNS" in [f.code for f in found.findings]
+    if "r" in order:
+        assert found.colours is not None
+        assert np.array_equal(found.colours, seen)
+    if "n" in order:
+        assert found.normals is not None
+        assert np.allclose(found.normals, normals, atol=1e-5)
+
+
+def test_a_unit_in_the_header_is_told_and_not_applied(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "cloud.csv", POINTS / 1000, delimiter=",", header="x_m,y_m,z_m", comments="")
+    found = read_cloud(tmp_path / "cloud.csv")
+    assert np.allclose(found.points, POINTS / 1000)
+    assert "--unit-mm 1000" in found.findings[0].hint
+
+
+@pytest.mark.parametrize("header", ["x,y,z,x", "x_mm,y_m,z_mm", "x,y,z,intensity,nx,ny,nz"])
+def test_a_header_that_contradicts_itself_or_the_rows_is_refused(tmp_path: Path, header: str) -> None:
+    table = np.column_stack([POINTS, POINTS[:, 0]])
+    np.savetxt(tmp_path / "cloud.csv", table, delimiter=",", header=header, comments="")
+    with pytest.raises(RefusedError) as refused:
+        read_cloud(tmp_path / "cloud.csv")
+    assert refused.value.findings[0].code == "SCAN-HEADER"
+
+
+@pytest.mark.parametrize("mark", [";", " ", "\t"])
+def test_numbers_with_a_decimal_comma_are_read_as_such(tmp_path: Path, mark: str) -> None:
+    lines = [mark.join(f"{value:.3f}".replace(".", ",") for value in row) for row in POINTS]
+    (tmp_path / "cloud.csv").write_text("\n".join(lines))
+    assert np.allclose(read_cloud(tmp_path / "cloud.csv").points, POINTS)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary"])
+def test_a_pcd_with_other_fields_and_missing_points_is_read(tmp_path: Path, form: str) -> None:
+    table = np.column_stack([POINTS, np.arange(len(POINTS))]).astype(np.float32)
+    table[3, :3] = np.nan
+    head = "VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+    head += f"WIDTH {len(table)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(table)}\nDATA {form}\n"
+    rows = "\n".join(" ".join(f"{v:.4f}" for v in row) for row in table).encode()
+    (tmp_path / "cloud.pcd").write_bytes(head.encode() + (rows if form == "ascii" else table.tobytes()))
+    found = read_cloud(tmp_path / "cloud.pcd")
+    assert np.allclose(found.points, np.delete(POINTS, 3, axis=0), atol=1e-3)
+    assert [f.code for f in found.findings] == ["SCAN-NAN"]
+
+
+@pytest.mark.parametrize("form", ["binary_big_endian", "binary_little_endian", "ascii"])
+def test_a_ply_with_other_properties_and_empty_faces_is_read(tmp_path: Path, form: str) -> None:
+    order = ">" if "big" in form else "<"
+    kinds = [
+        ("confidence", "f4"),
+        ("z", "f8"),
+        ("x", "f8"),
+        ("y", "f8"),
+        ("red", "u1"),
+        ("green", "u1"),
+        ("blue", "u1"),
+    ]
+    table = np.zeros(len(POINTS), dtype=[(n, order + k) for n, k in kinds])
+    table["x"], table["y"], table["z"] = POINTS.T
+    table["green"] = 77
+    said = {"f4": "float", "f8": "double", "u1": "uchar"}
+    head = ["ply", f"format {form} 1.0", "comment made by hand", f"element vertex {len(table)}"]
+    head += [f"property {said[k]} {n}" for n, k in kinds]
+    head += ["element face 0", "property list uchar int vertex_indices", "end_header", ""]
+    body = "\n".join(" ".join(str(v) for v in row) for row in table).encode() if form == "ascii" else table.tobytes()
+    (tmp_path / "cloud.ply").write_bytes("\n".join(head).encode() + body)
+    found = read_cloud(tmp_path / "cloud.ply")
+    assert np.array_equal(found.points, POINTS)
+    assert found.colours is not None
+    assert np.array_equal(found.colours[0], [0, 77, 0])
+
+
 def test_every_bad_line_of_a_label_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "marks.csv").write_text("label,x,y,z\na,1,2,3\nb,1,2\na,4,5,6\n")
     with pytest.raises(RefusedError) as fault:

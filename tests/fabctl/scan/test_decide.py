@@ -9,16 +9,21 @@ import pytest
 from scipy.spatial import cKDTree
 
 from design.targets import pierced_cap
-from fabctl.scan.borders import borne_out, circle
+from fabctl.scan.borders import Circle, borne_out, circle, rim_axis
 from fabctl.scan.clean import clean
+from fabctl.scan.decide import decide_by_border
+from fabctl.scan.edges import edge_finder
+from fabctl.scan.judge import Judged
 from fabctl.scan.markers import scale_from_board
 from fabctl.scan.paint import chosen_by_paint, paint_of
 from fabctl.scan.painted import marks_on_table
+from fabctl.scan.refine import Fit, Rows
 from fabctl.scan.register import Task, register
 from fabctl.scan.similarity import IDENTITY, Similarity, rotation_of
+from fabctl.scan.symmetry import Symmetries
 from fabctl.scan.target import Target
 from fabctl.vision.boards import scale_marks, sheet_ink
-from simulators.photogrammetry import ScanPlan
+from simulators.photogrammetry import ScanPlan, sample_mesh
 from tests.fabctl.scan.conftest import TARGETS, scanned, symmetries_of, true_pose
 
 
@@ -58,8 +63,12 @@ def test_one_pose_must_lead_clearly_for_colours_to_decide() -> None:
     assert chosen_by_paint([0.3, 0.05]) is None
 
 
+PIERCED = Target(pierced_cap(), "pierced")
+
+
 def test_points_in_the_hole_refute_a_turn_and_a_gap_of_the_scan_does_not() -> None:
-    target = Target(pierced_cap(), "pierced")
+    target, axis = PIERCED, rim_axis(PIERCED)
+    assert axis is not None
     points = target.even_samples(12_000)[0]
     turned = Similarity(rotation_of(np.array([0.0, 0.0, 1.5])), np.zeros(3))
     right, wrong = borne_out(cKDTree(points), IDENTITY, target), borne_out(cKDTree(points), turned, target)
@@ -68,18 +77,64 @@ def test_points_in_the_hole_refute_a_turn_and_a_gap_of_the_scan_does_not() -> No
     assert right.free()
     assert not right.contradicted()
     assert wrong.contradicted()
-    about_z = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
-    axis = np.concatenate([about_z[:3], np.cross(-target.centre_mm / target.diagonal_mm, about_z[:3]), [0.0]])
-    assert not circle(cKDTree(points), IDENTITY, axis, target).open_elsewhere()
-    hole = turned.inverse()(target.border.points_mm[target.border.loop == _hole(target)].mean(axis=0)[None])[0]  # type: ignore[union-attr]
-    gap = np.linalg.norm(points - hole, axis=1) > 0.12 * target.diagonal_mm
-    assert circle(cKDTree(points[gap]), IDENTITY, axis, target).open_elsewhere()
+    assert not round_about(points).open_elsewhere()
+    assert round_about(gap_at(points, 1.5, 0.12)).open_elsewhere()
 
 
-def _hole(target: Target) -> int:
-    assert target.border is not None
-    spans = [np.ptp(target.border.points_mm[target.border.loop == k], axis=0).max() for k in (0, 1)]
-    return int(np.argmin(spans))
+def round_about(points: np.ndarray) -> Circle:
+    finder, axis = edge_finder(points, IDENTITY, PIERCED), rim_axis(PIERCED)
+    assert finder is not None
+    assert axis is not None
+    return circle(cKDTree(points), finder, IDENTITY, axis)
+
+
+def gap_at(points: np.ndarray, turn_rad: float, radius_frac: float) -> np.ndarray:
+    """Return the points without a round gap where the hole would be if it were turned by `turn_rad`."""
+    border = PIERCED.border
+    assert border is not None
+    spans = [np.ptp(border.points_mm[border.loop == k], axis=0).max() for k in (0, 1)]
+    hole = border.points_mm[border.loop == int(np.argmin(spans))].mean(axis=0)
+    place = rotation_of(np.array([0.0, 0.0, turn_rad])) @ hole
+    return points[np.linalg.norm(points - place, axis=1) > radius_frac * PIERCED.diagonal_mm]
+
+
+def test_the_rims_axis_is_found_however_finely_the_rim_is_meshed() -> None:
+    axis = rim_axis(PIERCED)
+    assert axis is not None
+    assert np.abs(axis[0][:2]).max() < 0.05
+    assert abs(axis[1][2]) > 0.9999
+
+
+@pytest.mark.parametrize(("count", "enough"), [(6_000, False), (25_000, True), (60_000, True)])
+def test_the_holes_own_edge_decides_although_a_gap_could_hide_the_hole(count: int, enough: bool) -> None:
+    points = gap_at(scattered(count), 2.0, 0.13)
+    off = Similarity(rotation_of(np.array([0.0, 0.0, -2.0])), np.zeros(3))
+    chosen = decided(points, [off, IDENTITY])
+    assert (chosen is not None) == enough
+    assert chosen is None or chosen.pose is IDENTITY
+
+
+def scattered(count: int) -> np.ndarray:
+    return sample_mesh(PIERCED.mesh.vertices_mm, PIERCED.mesh.faces, count, np.random.default_rng(5))[0]
+
+
+@pytest.mark.parametrize("radius_frac", [0.055, 0.1, 0.115])
+def test_a_gap_about_as_large_as_the_hole_never_passes_for_it(radius_frac: float) -> None:
+    points = gap_at(gap_at(scattered(40_000), 0.0, 0.14), 2.0, radius_frac)
+    off = Similarity(rotation_of(np.array([0.0, 0.0, -2.0])), np.zeros(3))
+    assert decided(points, [off, IDENTITY]) is None
+
+
+def decided(points: np.ndarray, poses: list[Similarity]) -> Judged | None:
+    judged = [Judged(fit_at(pose), 0.001, 0.001, 0.7, 1.0) for pose in poses]
+    finder = edge_finder(points, poses[0], PIERCED)
+    assert finder is not None
+    return decide_by_border(finder, cKDTree(points), judged, Symmetries((), None, None))
+
+
+def fit_at(pose: Similarity) -> Fit:
+    nothing = Rows(np.zeros((0, 7)), np.zeros(0), np.zeros(0), np.zeros(0))
+    return Fit(pose, nothing, None, np.zeros(0), np.zeros(0), 0.0, 0, 0.0)
 
 
 @pytest.mark.parametrize("flip", [False, True])

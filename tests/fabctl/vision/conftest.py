@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import cast
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -29,6 +35,47 @@ SHEET = Sheet(
 
 def bed_scene(sheet: Sheet | None = None, **camera: object) -> Scene:
     return Scene(camera=replace(CAMERA, **camera), sheet=sheet)  # type: ignore[arg-type]
+
+
+class WebCamera(ThreadingHTTPServer):
+    """A camera on the loopback that gives `pictures` one after the other, and then is unplugged."""
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Answer)
+        self.pictures: list[NDArray[np.uint8]] = []
+
+    def use_on(self, root: Path) -> None:
+        """Make it the camera of the bench `sim` of the lab in `root`."""
+        packaged = Path(__file__).resolve().parents[3] / "configs" / "benches" / "sim.yaml"
+        url = f"http://127.0.0.1:{self.server_address[1]}/bed.png"
+        file = root / "configs" / "benches" / "sim.yaml"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(packaged.read_text().replace("ready:camera", url))
+
+
+class _Answer(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        pictures = cast(WebCamera, self.server).pictures
+        if not pictures:
+            self.close_connection = True
+            return
+        body = cv2.imencode(".png", pictures.pop(0))[1].tobytes()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Stay quiet."""
+
+
+@pytest.fixture
+def web_camera() -> Iterator[WebCamera]:
+    made = WebCamera()
+    threading.Thread(target=made.serve_forever, daemon=True).start()
+    yield made
+    made.shutdown()
+    made.server_close()
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from design.pattern.drawing import Drawing, as_json
+from drivers.errors import TransportError
 from fabctl.cli.main import cli
 from fabctl.config.boards import config_of, load_board, write_board
 from fabctl.config.material import load_material
@@ -23,7 +24,7 @@ from fabctl.vision.bed import alignment_path, lens_path
 from fabctl.vision.lens import Lens, write_lens
 from fabctl.workspace import Workspace
 from simulators.camera.picture import Studio
-from tests.fabctl.vision.conftest import BED, REGISTRATION, SHEET, bed_scene
+from tests.fabctl.vision.conftest import BED, REGISTRATION, SHEET, WebCamera, bed_scene
 from tests.fabctl.vision.test_cuts import JOB, photograph_coupon, trace_of
 
 Fabctl = Callable[..., dict[str, Any]]
@@ -76,8 +77,50 @@ def test_a_lens_is_calibrated_from_a_folder_of_pictures(
     made = fabctl("camera", "calibrate", *(f"{k}.png" for k in range(10)))
     assert made["rms_px"] < 0.1
     assert Path(made["lens"]).is_file()
+    assert cv2.imread(made["picture"]).shape[:2] == board_pictures[0].shape
     with pytest.raises(RefusedError, match="do not suffice"):
         fabctl("camera", "calibrate", "0.png", "1.png")
+
+
+def test_a_lens_is_calibrated_live_and_one_that_is_unplugged_meanwhile_leaves_none(
+    fabctl: Fabctl, tmp_path: Path, board_pictures: list[NDArray[np.uint8]], web_camera: WebCamera
+) -> None:
+    fabctl("camera", "board", "charuco")
+    web_camera.use_on(tmp_path)
+    web_camera.pictures = list(board_pictures[:4])
+    with pytest.raises(TransportError, match="no picture"):
+        fabctl("camera", "calibrate", "--views", "10")
+    assert not lens_path(Workspace(tmp_path).bench_state("sim")).exists()
+    web_camera.pictures = list(board_pictures)
+    assert fabctl("camera", "calibrate", "--views", "10")["views_count"] == 10
+
+
+def test_pictures_that_cannot_be_read_are_left_out_of_a_calibration_by_name(
+    fabctl: Fabctl, tmp_path: Path, board_pictures: list[NDArray[np.uint8]]
+) -> None:
+    fabctl("camera", "board", "charuco")
+    for k, picture in enumerate(board_pictures):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
+    (tmp_path / "0.png").write_bytes(b"ftypheic")
+    assert fabctl("camera", "calibrate", *(f"{k}.png" for k in range(10)))["views_count"] == 9
+    with pytest.raises(UsageError, match="none of the 1 files"):
+        fabctl("camera", "calibrate", "0.png")
+
+
+def test_a_bed_is_aligned_by_the_run_that_engraved_its_marks(fabctl: Fabctl, aligned: Path, tmp_path: Path) -> None:
+    runs = Workspace(tmp_path).runs
+    run = start_run(runs, "marks", config={"placement": [[1.0, 0.0, -300.0], [0.0, 1.0, -200.0]]})
+    words = ("camera", "align", "--image", str(aligned), "--engraved")
+    with pytest.raises(UsageError, match="no finished run"):
+        fabctl(*words, run.run_id)
+    run.finish("done")
+    made = fabctl(*words, run.run_id)
+    witness = json.loads(Path(made["alignment"]).read_text())["witnesses"][0]
+    mark = BED.mark(witness["id"])
+    assert mark is not None
+    assert (witness["x_mm"], witness["y_mm"]) == pytest.approx((mark.x_mm - 300, mark.y_mm - 200))
+    with pytest.raises(UsageError, match="no such run"):
+        fabctl(*words, "2020-marks")
 
 
 def test_a_sheet_is_registered_with_the_job_drawn_on_the_bed(fabctl: Fabctl, tmp_path: Path, aligned: Path) -> None:
@@ -155,3 +198,6 @@ def test_specimens_are_listed_noted_and_known_by_their_engraved_id(fabctl: Fabct
     cv2.imwrite("blank.png", cv2.resize(np.tile(np.array([[40, 200]], np.uint8), (60, 60)), (240, 240)))
     with pytest.raises(RefusedError, match="no specimen id"):
         fabctl("specimen", "read", "blank.png")
+    cv2.imwrite("mirror.png", page[:, ::-1])
+    with pytest.raises(RefusedError, match=f"{name} is seen in a mirror"):
+        fabctl("specimen", "read", "mirror.png")

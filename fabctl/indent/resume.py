@@ -1,0 +1,67 @@
+"""What is left of a plan after a run that was broken off, and what speaks against going on with it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterable, Sequence
+
+from design.findings import Finding
+from fabctl.config.method import MethodConfig
+from fabctl.indent.method import Action
+from fabctl.records.folder import RunFolder
+
+
+def resumed(
+    plan: Sequence[Action], done: Iterable[tuple[int, int]], untouched: Iterable[int] = ()
+) -> tuple[Action, ...]:
+    """Return what is left of a plan after the curves `done`, each (point, curve), and the points without contact.
+
+    Whole curves only: one that was broken off is run again. Every point that is left begins with its tare and approach,
+    so nothing is gone on with under an old zero.
+    """
+    finished, past = set(done), set(untouched)
+    curves = {(a.point, a.curve) for a in plan if a.curve}
+    left = {point for point, curve in curves - finished if point not in past}
+    kept = [a for a in plan if a.point in left and not (a.curve and (a.point, a.curve) in finished)]
+    return tuple(_without_idle_rests(kept))
+
+
+def _without_idle_rests(plan: Sequence[Action]) -> list[Action]:
+    """Drop rests that belonged to curves which are left out."""
+    return [a for k, a in enumerate(plan) if not (a.kind == "hold" and not a.curve and plan[k - 1].kind != "unload")]
+
+
+def curves_done(run: RunFolder) -> list[tuple[int, int]]:
+    """Return (point, curve) of every curve that a run finished, from its events."""
+    return [(data["point"], data["curve"]) for data in _told(run, "curve")]
+
+
+def points_without_contact(run: RunFolder) -> list[int]:
+    """Return the grid points at which a run met nothing, from its events."""
+    return [data["point"] for data in _told(run, "no_contact")]
+
+
+def _told(run: RunFolder, kind: str) -> list[dict[str, int]]:
+    found = []
+    path = run.path / "events.jsonl"
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
+        with contextlib.suppress(ValueError, KeyError):  # a last line may be cut short
+            event = json.loads(line)
+            if event["kind"] == kind:
+                found.append({"curve": 0, **event["data"]})
+    return found
+
+
+def against_resuming(run: RunFolder, specimen: str, method: MethodConfig) -> list[Finding]:
+    """Return what speaks against going on with `run`."""
+    manifest = run.manifest()
+    found = []
+    if manifest.get("kind") != "indent" or manifest.get("specimen") != specimen:
+        found.append(Finding("RESUME-OTHER", f"{run.run_id} is not a test of {specimen}"))
+    if manifest.get("config", {}).get("method") != method.model_dump(mode="json"):
+        found.append(Finding("RESUME-METHOD", "the method has changed since", hint="run it from the beginning"))
+    outcome = run.outcome()
+    if outcome is not None and outcome["status"] == "done":
+        found.append(Finding("RESUME-DONE", f"{run.run_id} came to its end"))
+    return found
