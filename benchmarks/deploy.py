@@ -354,7 +354,7 @@ def compensation() -> list[Figure]:
         held = standing(layout, goal, SHEET, support)
         heavy = solve_level(layout, goal, held.loads, held.fixed)
         found = compensate(layout, goal, bounds, standing=held)
-        rms = [sphere_rms_mm(e.x_mm, layout, held.aligned) for e in (heavy, found.equilibrium)]
+        rms = [sphere_rms_mm(e.x_mm, held.aligned) for e in (heavy, found.equilibrium)]
         figures += _gains(f"heavy cap, rim {support}", found, *rms)
     return figures
 
