@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from fabctl.deploying import Laid
     from fabctl.events import Emit
 
+PLACE_MM = click.FloatRange(-100_000, 100_000)
+
 
 @click.command()
 @click.argument("design", type=InFolder())
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 @click.option(
     "--hint",
     "hints",
-    type=(float, float, click.Choice(["up", "down"])),
+    type=(PLACE_MM, PLACE_MM, click.Choice(["up", "down"])),
     multiple=True,
     metavar="X Y up|down",
     help="Push the bump at X, Y (mm from the middle of the cells' box) to a side; may be given again.",
