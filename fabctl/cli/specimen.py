@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,27 +62,18 @@ def show_specimen(name: str, as_json: bool) -> None:
 @command.command("note")
 @click.argument("name", type=SPECIMEN)
 @click.argument("facts", nargs=-1, required=True, metavar="KEY=VALUE…")
+@click.option("--free", is_flag=True, help="Allow other keys than the known ones; no run or report reads them.")
 @json_option
-def note(name: str, facts: tuple[str, ...], as_json: bool) -> None:
-    """Write facts about a specimen: thickness_mm=2.31 batch=B7."""
-    specimen = lab().specimen(name)
-    parsed = dict(_fact(text) for text in facts)
-    specimen.note(**parsed)
-    show(specimen.record(), as_json, [f"{name}: noted {', '.join(parsed)}"])
+def note(name: str, facts: tuple[str, ...], free: bool, as_json: bool) -> None:
+    """Write facts about a specimen: thickness_mm=2.31 batch=B7.
 
+    Known facts are thickness_mm, batch, rest_h, deployed_utc and remark.
+    """
+    from fabctl.notes import read_notes
 
-def _fact(text: str) -> tuple[str, Any]:
-    key, sign, value = text.partition("=")
-    if not sign or not key.isidentifier():
-        raise click.UsageError(f"{text!r} is not KEY=VALUE")
-    if key in ("id", "made_utc", "design"):
-        raise click.UsageError(f"{key} was given at the cut and stays")
-    try:
-        number = json.loads(value)
-    except ValueError:
-        return key, value
-    # NaN and Infinity pass json.loads, and a record must not hold them.
-    return key, value if isinstance(number, float) and number - number != 0 else number
+    specimen, noted = lab().specimen(name), read_notes(facts, free)
+    specimen.note(**noted)
+    show(specimen.record(), as_json, [f"{name}: noted {', '.join(noted)}"])
 
 
 def _why_no_id(image: NDArray[np.uint8], path: Path) -> Finding:
