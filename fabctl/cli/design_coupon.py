@@ -26,10 +26,17 @@ library_option = click.option("--library", type=InFile(), help="Library of cells
     "--material", type=MATERIAL, default="natural-rubber-2.3", show_default=True, help="Material file or its name."
 )
 @library_option
-@click.option("-o", "--output", type=OutFolder(), required=True, help="New folder for the coupon.")
+@click.option("-o", "--output", type=OutFolder(), required=True, help="Folder for the coupon.")
+@click.option("--replace", is_flag=True, help="Replace a design or coupon that lies in that folder.")
 @json_option
 def coupon(
-    expansion_ratio: float, hinges_mm: str, material: str, library: Path | None, output: Path, as_json: bool
+    expansion_ratio: float,
+    hinges_mm: str,
+    material: str,
+    library: Path | None,
+    output: Path,
+    replace: bool,
+    as_json: bool,
 ) -> None:
     """Make a sheet of uniform patches, one a hinge width, to check the library on the real material.
 
@@ -44,7 +51,7 @@ def coupon(
         raise click.UsageError("--hinges-mm takes widths from 0.01 to 10 mm")
     chosen_from = None if library is None else str(library.resolve())
     asked = CouponConfig(material=material, expansion_ratio=expansion_ratio, hinges_mm=hinges, library=chosen_from)
-    made, bundle = write_coupon(output, asked, lab().root)
+    made, bundle = write_coupon(output, asked, lab().root, replace)
     width, height = made.drawing.size_mm
     lines = [f"{output}: {len(made.patches)} patches on {width:.0f} × {height:.0f} mm"]
     for patch in made.patches:

@@ -24,6 +24,7 @@ NAMED = (
     ("barrier", "barrier_mJ", "mJ"),
     ("recovery", "recovery_ratio", ""),
 )
+HELD = (("relaxation", "relaxation_ratio", ""), ("creep", "creep_mm", "mm"))  # told only where a method holds
 WORDS = {name: words for words, name, _ in NAMED}
 
 
@@ -203,7 +204,7 @@ def _short(entry: dict[str, Any]) -> str:
 
 
 def _lines(result: dict[str, Any]) -> Iterator[str]:
-    for words, name, unit in NAMED:
+    for words, name, unit in (*NAMED, *(row for row in HELD if result.get(row[1]) is not None)):
         value = result.get(name)
         if value is None:
             yield f"  {words:22} not found: {result.get('not_found', {}).get(name, 'no curve')}"
