@@ -18,10 +18,11 @@ from design.cells.library import CellLibrary, hexagon_mm2
 from design.cells.sheet import Sheet
 from design.deploy.cascade import Wells
 from design.deploy.designed import lift
-from design.deploy.levels import Layout, prolong, refine, sheet_layout
+from design.deploy.levels import Layout, prolong, refine
 from design.deploy.shell import Reals
 from design.findings import Finding
 from design.meshfiles import read_mesh
+from design.preview import few_ticks
 from design.surface import TriMesh
 from fabctl.config.material import load_material
 from fabctl.config.spec import load_spec
@@ -45,6 +46,11 @@ class Laid:
     theta_rad: Reals
     library: CellLibrary  # of this sheet
 
+    @property
+    def goal_mm(self) -> Reals:
+        """Return where each vertex belongs as far as the folder tells, `(n, 3)`."""
+        return self.start_mm if self.design_mm is None else self.design_mm
+
 
 def read_laid(folder: Path, home: Path) -> Laid:
     """Return the shell of a design folder; raise `BundleError`, or `RefusedError` where it was built without one."""
@@ -59,7 +65,7 @@ def read_laid(folder: Path, home: Path) -> Laid:
     t, theta, expansion = table["t_mm"], np.deg2rad(table["theta_deg"]), table["expansion_ratio"]
     shape, _ = read_mesh(bundle.file("deployed.ply"))
     edge_mm = _edge_mm(centre)
-    flat = _flat_vertices(centre, inverted, edge_mm, shape)
+    corners = _flat_corners(centre, inverted, edge_mm, shape)
     config, _ = load_spec(str(bundle.file("spec.yaml")), home)
     sheet = sheet_of(load_material(config.material, home), edge_mm)
     library = library_of(config, library_file(config, folder)).scaled(sheet)
@@ -78,10 +84,8 @@ def read_laid(folder: Path, home: Path) -> Laid:
     D = np.where(stays_open, D, sheet.E_MPa * sheet.thickness_mm**3 / 12)
     target, _ = read_mesh(bundle.file("target.ply"))
     paper, _ = read_mesh(bundle.file("flat.ply"))
-    goal = None
-    if len(paper.faces) == len(target.faces):
-        goal = lift(flat, paper.vertices_mm[:, :2], paper.faces, target.vertices_mm, target.faces)
-    layout = sheet_layout(flat, shape.faces, expansion, Y, nu, D)
+    layout = Layout(np.asarray(shape.faces, dtype=np.int64), corners, edge_mm, expansion, Y, nu, D)
+    goal = _goal_mm(layout, paper, target) if len(paper.faces) == len(target.faces) else None
     return Laid(layout, shape.vertices_mm, target, goal, sheet, t, theta, library)
 
 
@@ -96,9 +100,12 @@ def divided(laid: Laid, parts: int) -> Laid:
 
 
 def wells_of(laid: Laid) -> Wells:
-    """Return each cell's whole energy curve; raise `RefusedError` where a cell has no second state or closes."""
+    """Return each cell's whole energy curve; raise `RefusedError` where there is none to follow."""
     if is_contracting(laid.library):
         fault = Finding("CASCADE-CLOSING", "the cells contract", hint="unit by unit goes with expanding cells only")
+        raise RefusedError("the sheet cannot be opened cell by cell", [fault])
+    if laid.layout.rejoined_count():
+        fault = Finding("CASCADE-SEAM", "its seam is joined", hint="unit by unit goes with sheets that lie flat only")
         raise RefusedError("the sheet cannot be opened cell by cell", [fault])
     if np.any(laid.layout.expansion_ratio <= 1):
         fault = Finding("CASCADE-SOLID", "some cells are not cut or spring back", hint="they have no two wells to snap")
@@ -117,20 +124,47 @@ def _edge_mm(centre_mm: Reals) -> float:
     return float(np.median(nearest[:, 1]) * np.sqrt(3))
 
 
-def _flat_vertices(centre: Reals, inverted: NDArray[np.bool_], edge_mm: float, shape: TriMesh) -> Reals:
-    """Return the flat position of the deployed mesh's vertices; its faces are the cells, in their order."""
+def _flat_corners(centre: Reals, inverted: NDArray[np.bool_], edge_mm: float, shape: TriMesh) -> Reals:
+    """Return the flat corners `(m, 3, 2)` of the deployed mesh's faces, which are the cells in their order.
+
+    A vertex on a re-joined seam lies at two places of the flat, a period apart; any other one must lie at one.
+    """
     low, high = edge_mm / np.sqrt(12), edge_mm / np.sqrt(3)
     upright = np.array([[-edge_mm / 2, -low], [edge_mm / 2, -low], [0, high]])
     hanging = np.array([[0, -high], [edge_mm / 2, low], [-edge_mm / 2, low]])
     corners = centre[:, None] + np.where(inverted[:, None, None], hanging, upright)
     if len(shape.faces) != len(corners):
         raise RefusedError("the deployed mesh is not that of the cells", [])
-    flat = np.full((len(shape.vertices_mm), 2), np.nan)
-    flat[shape.faces.ravel()] = corners.reshape(-1, 2)
-    if np.abs(flat[shape.faces] - corners).max() > ROUNDING_MM:
-        fault = Finding("DEPLOY-SEAM", "the design has a re-joined seam", hint="use the prediction of the build")
+    apart = np.linalg.norm(_places_apart_mm(corners, shape.faces), axis=1)
+    joined = apart > edge_mm
+    if np.any(apart[~joined] > ROUNDING_MM) or (joined.any() and np.ptp(apart[joined]) > ROUNDING_MM):
+        fault = Finding("DEPLOY-SEAM", "its corners do not meet as those of the deployed mesh do", hint="build it anew")
         raise RefusedError("the deployed mesh does not lie flat as the cells do", [fault])
-    return flat
+    return corners
+
+
+def _places_apart_mm(corners_mm: Reals, faces: NDArray[np.int64]) -> Reals:
+    """Return for each vertex by how much its places in the flat differ, `(n, 2)`."""
+    low = np.full((int(faces.max()) + 1, 2), np.inf)
+    high = -low
+    np.minimum.at(low, faces.ravel(), corners_mm.reshape(-1, 2))
+    np.maximum.at(high, faces.ravel(), corners_mm.reshape(-1, 2))
+    return np.asarray(high - low, dtype=np.float64)
+
+
+def _goal_mm(layout: Layout, paper: TriMesh, target: TriMesh) -> Reals:
+    """Return where each vertex belongs on the target, `(n, 3)`; around a tube the flat goes on period after period."""
+    import igl
+
+    flat, level = layout.flat_mm(), np.ascontiguousarray(paper.vertices_mm * [1.0, 1.0, 0.0])
+    period = _places_apart_mm(layout.corners_mm, layout.cells).max(axis=0) * [1.0, 0.0]
+    if layout.rejoined_count():
+        turns = [np.column_stack([flat + k * period, np.zeros(len(flat))]) for k in (0, 1, -1)]
+        away = [
+            igl.point_mesh_squared_distance(points, level, np.ascontiguousarray(paper.faces))[0] for points in turns
+        ]
+        flat = np.asarray(turns)[np.argmin(np.round(away, 6), axis=0), np.arange(len(flat)), :2]
+    return lift(flat, paper.vertices_mm[:, :2], paper.faces, target.vertices_mm, target.faces)
 
 
 def picture_png(mesh: TriMesh, target: TriMesh, title: str) -> bytes:
@@ -182,5 +216,6 @@ def _stage(mesh: TriMesh, title: str):  # type: ignore[no-untyped-def]  # matplo
     for k, name in enumerate("xyz"):
         getattr(axes, f"set_{name}lim")(middle[k] - reach, middle[k] + reach)
         getattr(axes, f"set_{name}label")(f"{name}, mm")
+    few_ticks(axes)
     axes.set_title(title)
     return figure, axes, faces

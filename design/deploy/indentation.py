@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from design.deploy.levels import Layout, prolong, refine
 from design.deploy.newton import Equilibrium, System, smallest_eigenvalue_N_mm, solve
-from design.deploy.shell import Ints, Reals
+from design.deploy.shell import Ints, Reals, neighbours
 from design.errors import NotConverged
 
 CONTACT_RATIO = 20.0  # stiffness of a contact point over median k_d: it sinks in by a thousandth of a millimetre or so
@@ -74,12 +74,28 @@ class Sphere:
 
 def border(cells: Ints, vertex_count: int) -> NDArray[np.bool_]:
     """Return which vertices lie on the rim, `(n,)`."""
-    from design.deploy.shell import neighbours
-
     unit, corner = np.nonzero(neighbours(cells) < 0)
     rim = np.zeros(vertex_count, dtype=bool)
     rim[cells[unit, (corner + 1) % 3]] = rim[cells[unit, (corner + 2) % 3]] = True
     return rim
+
+
+def standing_rim(cells: Ints, x_mm: Reals) -> NDArray[np.bool_]:
+    """Return the vertices `(n,)` of the rims that a sheet stands on: those below its middle height, all if none is.
+
+    A vase stands on its foot and not on its lip, a pierced cap not on its hole.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    unit, corner = np.nonzero(neighbours(cells) < 0)
+    start, end = cells[unit, (corner + 1) % 3], cells[unit, (corner + 2) % 3]
+    graph = coo_matrix((np.ones(len(start)), (start, end)), shape=(len(x_mm), len(x_mm)))
+    _, loop = connected_components(graph, directed=False)
+    rim = border(cells, len(x_mm))
+    middle = 0.5 * (x_mm[:, 2].min() + x_mm[:, 2].max())
+    low = [k for k in np.unique(loop[rim]) if x_mm[loop == k, 2].mean() < middle]
+    return np.asarray(rim & np.isin(loop, low) if low else rim)
 
 
 def first_contact(x_mm: Reals, point_mm: Reals, direction: Reals, radius_mm: float) -> float:
@@ -105,7 +121,7 @@ def indentation_response(
     parts: int | None = None,
     watch: Callable[[float], None] | None = None,
 ) -> Response:
-    """Return the load of a rigid sphere pressed to `depth_max_mm` at a point and drawn back, rim held.
+    """Return the load of a rigid sphere pressed to `depth_max_mm` at a point and drawn back, its lower rim held.
 
     `x_mm` is the deployed equilibrium of `layout`. The point is by default the highest against `direction`. Each unit
     is divided into `parts`² triangles (by default until there are about 1,500), because the footprint is smaller than
@@ -122,7 +138,7 @@ def indentation_response(
     foot = x[int(np.argmin(x @ way))] if point_mm is None else np.asarray(point_mm, float)
     start = first_contact(x, foot, way, indenter_radius_mm)
     foot = foot + start * way
-    rim = border(fine.cells, fine.vertex_count)
+    rim = standing_rim(fine.cells, x)
     stiffness = np.full(fine.vertex_count, CONTACT_RATIO * float(np.median(system.shell.dilation_N_mm)))
     depths = np.linspace(0.0, depth_max_mm, steps_count + 1)
     loads: list[float] = []

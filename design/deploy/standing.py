@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.cells.sheet import Sheet
-from design.deploy.indentation import CONTACT_RATIO, border
+from design.deploy.indentation import CONTACT_RATIO, standing_rim
 from design.deploy.levels import Layout
 from design.deploy.newton import Load
 from design.deploy.shell import Reals
@@ -40,7 +40,7 @@ def standing(layout: Layout, goal_mm: Reals, sheet: Sheet, support: Support, fri
     if support == "free":
         return FREE
     weight = weight_of(layout, sheet)
-    rim = border(layout.cells, layout.vertex_count)
+    rim = standing_rim(layout.cells, goal_mm)
     if support == "held":
         return Standing((weight,), np.repeat(rim[:, None], 3, axis=1), False)
     stiffness_N_mm = CONTACT_RATIO * float(np.median(layout.shell().dilation_N_mm))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.cells.sheet import Sheet
-from design.deploy.indentation import CONTACT_RATIO, border
+from design.deploy.indentation import CONTACT_RATIO, standing_rim
 from design.deploy.levels import Layout
 from design.deploy.newton import Equilibrium, Load, System, smallest_eigenvalue_N_mm, solve
 from design.deploy.shell import Reals
@@ -146,7 +146,7 @@ def settle(
         raise ValueError("a sheet with weight needs a support")
     system = System(layout.shell())
     whole = weight_of(layout, sheet)
-    rim = border(layout.cells, layout.vertex_count)
+    rim = standing_rim(layout.cells, x_mm)
     lowest = float(x_mm[:, 2].min())
     height = np.where(rim & bedded, x_mm[:, 2], lowest)
     floor = Floor(height, CONTACT_RATIO * float(np.median(system.shell.dilation_N_mm)))

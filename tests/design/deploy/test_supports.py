@@ -7,6 +7,7 @@ import pytest
 
 from design.cells.sheet import Sheet
 from design.deploy.equilibrium import solve_level
+from design.deploy.indentation import border, standing_rim
 from design.deploy.supports import Floor, Friction, Weight, settle, weight_of
 
 
@@ -69,6 +70,25 @@ def test_friction_obeys_its_limit(standing) -> None:
     assert smooth.slid_mm > rough.slid_mm
     assert rough.equilibrium.residual_ratio < 1e-8
     assert rough.smallest_eigenvalue_N_mm > 0
+
+
+def test_a_pierced_sheet_stands_on_its_outer_rim_and_not_on_its_hole(cap_of) -> None:
+    cap = cap_of(edge_mm=8.0)
+    centre = cap.layout.corners_mm.mean(axis=1)
+    used, cells = np.unique(cap.layout.cells[np.hypot(*centre.T) > 15], return_inverse=True)
+    cells, x = cells.reshape(-1, 3), cap.design_mm[used]
+    rim, stands = border(cells, len(x)), standing_rim(cells, x)
+    assert 0 < stands.sum() < rim.sum()
+    assert np.all(rim[stands])
+    assert x[rim & ~stands, 2].min() > x[stands, 2].max()
+    upside_down = standing_rim(cells, x * [1.0, 1.0, -1.0])
+    assert np.array_equal(upside_down, rim & ~stands)
+
+
+def test_a_sheet_whose_only_rim_is_on_top_stands_on_it(cap_of) -> None:
+    cap = cap_of(edge_mm=10.0)
+    bowl = cap.design_mm * [1.0, 1.0, -1.0]
+    assert np.array_equal(standing_rim(cap.layout.cells, bowl), border(cap.layout.cells, len(bowl)))
 
 
 def test_a_weight_without_support_is_refused(standing) -> None:
