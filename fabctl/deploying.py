@@ -46,6 +46,11 @@ class Laid:
     theta_rad: Reals
     library: CellLibrary  # of this sheet
 
+    @property
+    def goal_mm(self) -> Reals:
+        """Return where each vertex belongs as far as the folder tells, `(n, 3)`."""
+        return self.start_mm if self.design_mm is None else self.design_mm
+
 
 def read_laid(folder: Path, home: Path) -> Laid:
     """Return the shell of a design folder; raise `BundleError`, or `RefusedError` where it was built without one."""

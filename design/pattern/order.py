@@ -23,9 +23,9 @@ FIRST_COUNT = 5  # ways tried at a chain's first link
 ROUNDS_COUNT, ROUND_GAIN_RATIO = 5, 0.004  # all ends are looked at again while a round still gains this much
 RUN_COUNT = 3  # strokes moved together at most
 KICK_COUNT = 30  # strokes in a run that a kick moves at most
-KICK_CHAIN_COUNT, KICK_FIRST_COUNT = 10, 5  # the same while a kick is repaired
+KICK_CHAIN_COUNT, KICK_FIRST_COUNT = 6, 2  # the same while a kick is repaired
 KICK_REACH_COUNT = 1000  # ends turned around in one exchange while a kick is repaired: more costs more than it gains
-KICKS_LIMIT_COUNT = 3000  # about a second, on 20,000 strokes a fifth of the whole
+KICKS_LIMIT_COUNT = 6000  # about a second, on 20,000 strokes a third of the whole
 GAIN_MM = 1e-7  # less is rounding
 
 
@@ -42,10 +42,13 @@ def tour(
         return np.arange(2 * count)
     home = np.tile(np.asarray(start_mm, dtype=np.float64), (2, 1))
     points = np.ascontiguousarray(np.vstack([ends_mm, home]))
-    near = _near(points)
-    order = nearest_ends(points, 2 * count)
+    # Numbered as the first tour meets them, ends that are looked at together lie together in memory.
+    first = nearest_ends(points, 2 * count)
+    points = np.ascontiguousarray(points[first])
+    order = np.arange(len(first))
     kicks = kicks_count if kicks_count is not None else min(10 * count, KICKS_LIMIT_COUNT)
-    _improve(points, near, order, kicks, seed)
+    _improve(points, _near(points), order, kicks, seed)
+    order = first[order]
     at = int(np.flatnonzero(order >= 2 * count)[0])
     # The two home ends are neighbours; at an even place, because strokes stay whole.
     return np.asarray(np.roll(order, -at)[2:])
@@ -91,8 +94,8 @@ def _mate(order: Index, pos: Index, v: int) -> Any:
     """Return the end that `v` is linked to by travel."""
     n = len(order)
     p = pos[v]
-    q = p + 1 if p % 2 else p - 1
-    return order[q % n]
+    q = p + 1 if p & 1 else p - 1
+    return order[0 if q == n else n - 1 if q < 0 else q]
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -155,7 +158,7 @@ def _was_added(log: Index, begun: int, a: int, b: int) -> bool:
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _offer(top: Array, ends: Index, value: float, t3: int, t5: int) -> None:
     """Keep an exchange among the most promising, best first."""
-    k = len(top) - 1
+    k = FIRST_COUNT - 1
     if value <= top[k]:
         return
     while k > 0 and top[k - 1] < value:
@@ -173,11 +176,12 @@ def _exchanges(
 
     A near t3 that is met the same way as t2 takes one exchange: its mate t4 becomes the loose end. One that is met the
     other way would close t2 … t3 to a ring; the ring is opened again at a t5 near t4, whose mate becomes the loose end.
+    The last row is the exchange that gains most when the loose ends are linked at once, and that gain.
     """
     n = len(order)
     top[:] = -np.inf
     t2 = _mate(order, pos, t1)
-    step = 1 if pos[t1] % 2 else -1  # the way that leads from t2 away from t1
+    step = 1 if pos[t1] & 1 else -1  # the way that leads from t2 away from t1
     for m in range(near.shape[1]):
         t3 = near[t2, m]
         left = gained - _gap(points, t2, t3)
@@ -186,11 +190,16 @@ def _exchanges(
         t4 = _mate(order, pos, t3)
         if t3 == t1 or _was_added(log, begun, t3, t4):
             continue
-        span = (pos[t3] - pos[t2]) * step % n
+        span = (pos[t3] - pos[t2]) * step
+        if span < 0:
+            span += n
         value = left + _gap(points, t3, t4)
-        if span % 2 == 0:
+        if span & 1 == 0:
             if min(span, n - span) <= reach:
                 _offer(top, ends, value, t3, -1)
+                closed = value - _gap(points, t1, t4)
+                if closed > top[FIRST_COUNT]:
+                    top[FIRST_COUNT], ends[FIRST_COUNT, 0], ends[FIRST_COUNT, 1] = closed, t3, -1
             continue
         if span > reach:
             continue
@@ -199,12 +208,18 @@ def _exchanges(
             rest = value - _gap(points, t4, t5)
             if rest <= GAIN_MM:
                 break
-            inward = (pos[t5] - pos[t2]) * step % n
+            inward = (pos[t5] - pos[t2]) * step
+            if inward < 0:
+                inward += n
             if not 0 < inward < span:
                 continue
             t6 = _mate(order, pos, t5)
             if not _was_added(log, begun, t5, t6):
-                _offer(top, ends, rest + _gap(points, t5, t6), t3, t5)
+                promise = rest + _gap(points, t5, t6)
+                _offer(top, ends, promise, t3, t5)
+                closed = promise - _gap(points, t1, t6)
+                if closed > top[FIRST_COUNT]:
+                    top[FIRST_COUNT], ends[FIRST_COUNT, 0], ends[FIRST_COUNT, 1] = closed, t3, t5
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -301,7 +316,7 @@ def _settle(
     """
     size = len(queue) - 2
     total = 0.0
-    top, ends = np.empty(FIRST_COUNT), np.empty((FIRST_COUNT, 2), np.int64)
+    top, ends = np.empty(FIRST_COUNT + 1), np.empty((FIRST_COUNT + 1, 2), np.int64)
     while queue[1] > 0:
         v = queue[2 + queue[0]]
         queue[0] = (queue[0] + 1) % size
@@ -311,6 +326,12 @@ def _settle(
         if begun + 3 * CHAIN_COUNT + 8 > len(log):
             log[0, 0] = begun = 0  # only the first, kickless round is this long, and is never taken back
         gain = _shift(points, near, order, pos, log, v)
+        if gain == 0.0:
+            unlinked = _gap(points, v, _mate(order, pos, v))
+            _exchanges(points, near, order, pos, log, begun, v, unlinked, reach, top, ends)
+            if top[FIRST_COUNT] > GAIN_MM:
+                gain = top[FIRST_COUNT]
+                _exchange(points, order, pos, log, v, ends[FIRST_COUNT, 0], ends[FIRST_COUNT, 1])
         for first in range(firsts):
             if gain == 0.0:
                 gain = _chain(points, near, order, pos, log, v, first, reach, chain, top, ends)

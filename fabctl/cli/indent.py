@@ -46,11 +46,15 @@ def command() -> None:
 @click.option(
     "--resume", type=RUN, metavar="RUN", help="Go on with an interrupted run, at its next whole curve or point."
 )
-@click.option("--temperature-degC", type=float, help="Room temperature, where the rig has no sensor of its own.")
+@click.option(
+    "--temperature-degC",
+    type=click.FloatRange(-50, 150),
+    help="Room temperature, where the rig has no sensor of its own.",
+)
 @click.option("--humidity-frac", type=click.FloatRange(0, 1), help="Relative humidity, 0 to 1.")
-@click.option("--thickness-mm", type=click.FloatRange(min=0, min_open=True), help="As measured on this specimen.")
+@click.option("--thickness-mm", type=click.FloatRange(0, 100, min_open=True), help="As measured on this specimen.")
 @click.option("--batch", help="Of the material.")
-@click.option("--rest-h", type=click.FloatRange(min=0), help="Hours since it was deployed, or last pressed.")
+@click.option("--rest-h", type=click.FloatRange(0, 100_000), help="Hours since it was deployed, or last pressed.")
 @click.option("--dry-run", is_flag=True, help="Stop after the check; nothing moves.")
 @yes_option
 @json_option
@@ -142,8 +146,9 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
     type=click.Choice(["csv", "parquet", "hdf5", "bluesky"]),
     default="csv",
     show_default=True,
+    help="Of the file.",
 )
-@click.option("-o", "--output", type=OutFile(), required=True)
+@click.option("-o", "--output", type=OutFile(), required=True, help="The file to write.")
 @json_option
 def export_command(run: str, kind: str, output: Path, as_json: bool) -> None:
     """Write the samples of RUN for other programs: CSV with units, Parquet, HDF5, or bluesky documents."""

@@ -55,9 +55,13 @@ def show_command(file: Path | None, as_json: bool) -> None:
 
 @command.command()
 @file_option
-@click.option("--t-mm", type=float, help="Plot energy and force of this cell instead of the maps.")
-@click.option("--theta-deg", type=float)
-@click.option("-o", "--output", type=PictureFile(), default=Path("library.svg"), show_default=True)
+@click.option(
+    "--t-mm", type=click.FloatRange(-1000, 1000), help="Plot energy and force of this cell instead of the maps."
+)
+@click.option("--theta-deg", type=click.FloatRange(-360, 360), help="Direction of slit 1 of that cell.")
+@click.option(
+    "-o", "--output", type=PictureFile(), default=Path("library.svg"), show_default=True, help="The picture to write."
+)
 @json_option
 def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output: Path, as_json: bool) -> None:
     """Draw the four maps, or energy and force of one cell along its uniaxial stretch."""
@@ -254,8 +258,8 @@ def _finite(value: Any) -> Any:
 @command.command()
 @click.argument("measured", type=InFile())
 @click.argument("response", type=InFile())
-@click.option("--point", type=int, help="Which of MEASURED's points, where it has several.")
-@click.option("--curve", type=int, help="Which curve of that point [the last].")
+@click.option("--point", type=click.IntRange(0, 9999), help="Which of MEASURED's points, where it has several.")
+@click.option("--curve", type=click.IntRange(0, 9999), help="Which curve of that point [the last].")
 @material_option
 @json_option
 def calibrate(

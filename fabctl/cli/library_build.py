@@ -24,15 +24,22 @@ REACH_S = 5.0  # a scheduler that takes longer to be reached is not there
 @click.command()
 @material_option
 @click.option(
-    "--theta", "theta_count", type=click.IntRange(5), default=43, show_default=True, help="Angles, -30° to 30°."
+    "--theta", "theta_count", type=click.IntRange(5, 1001), default=43, show_default=True, help="Angles, -30° to 30°."
 )
-@click.option("--t-step-mm", type=float, default=0.01, show_default=True, help="Step of t.")
+@click.option("--t-step-mm", type=click.FloatRange(0.001, 10), default=0.01, show_default=True, help="Step of t.")
 @click.option(
     "--open", "is_open", is_flag=True, help="The contracting kind: cut as holes, closing to its second state."
 )
 @jobs_option
 @click.option("--cluster", metavar="URL", help="A dask scheduler, tcp://HOST:PORT, whose workers have fabctl.")
-@click.option("-o", "--output", type=OutFile((".npz",), "a library"), default=Path("library.npz"), show_default=True)
+@click.option(
+    "-o",
+    "--output",
+    type=OutFile((".npz",), "a library"),
+    default=Path("library.npz"),
+    show_default=True,
+    help="The library file to write.",
+)
 @json_option
 def build(
     material: str,

@@ -22,9 +22,13 @@ material_option = click.option(
 file_option = click.option(
     "--library", "file", type=InFile(), help="A library file [the shipped one of the paper's sheet]."
 )
-t_option = click.option("--t-mm", type=float, required=True, help="Where slit 1 starts on its edge.")
-theta_option = click.option("--theta-deg", type=float, required=True, help="Direction of slit 1.")
-jobs_option = click.option("--jobs", type=int, default=-1, show_default=True, help="Processes; -1 is one per core.")
+t_option = click.option(
+    "--t-mm", type=click.FloatRange(-1000, 1000), required=True, help="Where slit 1 starts on its edge."
+)
+theta_option = click.option("--theta-deg", type=click.FloatRange(-360, 360), required=True, help="Direction of slit 1.")
+jobs_option = click.option(
+    "--jobs", type=click.IntRange(-1, 1024), default=-1, show_default=True, help="Processes; -1 is one per core."
+)
 
 
 def sheet_named(material: str) -> Sheet:

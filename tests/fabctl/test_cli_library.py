@@ -138,8 +138,9 @@ def test_compare_names_the_rows_without_a_cell_and_why(tmp_path: Path) -> None:
 
 def test_show_says_how_many_cells_were_decided_on_the_finer_mesh(tmp_path: Path) -> None:
     told = json.loads(run("show", "--json", home=tmp_path).stdout)
-    assert told["shallow_count"] == 28
-    assert "28 of them were decided at half the mesh size" in run("show", home=tmp_path).stdout
+    count = len(load_library().shallow_cells()[0])
+    assert told["shallow_count"] == count > 100
+    assert f"{count} of them were decided at half the mesh size" in run("show", home=tmp_path).stdout
 
 
 def test_the_command_loads_no_numpy_before_it_has_asked_for_one_thread() -> None:
