@@ -72,10 +72,15 @@ def sphere_deviation_mm(x: Reals, layout: Layout) -> tuple[float, Reals]:
     return float(np.average(np.abs(np.linalg.norm(points - centre, axis=1) - CAP_MM), weights=area)), x - centre
 
 
-def sphere_rms_mm(x: Reals, layout: Layout, aligned: bool) -> float:
-    """Return the RMS distance of the vertices from the target's sphere, about its own centre or the best one."""
-    about = sphere_deviation_mm(x, layout)[1] if aligned else x
-    return float(np.sqrt(np.mean((np.linalg.norm(about, axis=1) - CAP_MM) ** 2)))
+def sphere_rms_mm(x: Reals, aligned: bool) -> float:
+    """Return the RMS distance of the vertices from the cap's sphere, where it stands or moved to fit best."""
+    from scipy.optimize import least_squares
+
+    def gap(centre: Reals) -> Reals:
+        return np.asarray(np.linalg.norm(x - centre, axis=1) - CAP_MM)
+
+    centre = least_squares(gap, np.zeros(3)).x if aligned else np.zeros(3)
+    return float(np.sqrt(np.mean(gap(centre) ** 2)))
 
 
 def shared_folder() -> Path:

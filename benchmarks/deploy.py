@@ -37,7 +37,7 @@ from design.deploy.equilibrium import from_flat, rolled, solve_level
 from design.deploy.factor import factorise
 from design.deploy.indentation import Response, indentation_response
 from design.deploy.levels import Layout
-from design.deploy.newton import System, pins
+from design.deploy.newton import Equilibrium, System, fold_angles, pins
 from design.deploy.predict import compared
 from design.deploy.search import equilibria
 from design.deploy.shell import Shell, build_shell
@@ -163,8 +163,6 @@ def _cylinder_error() -> float:
     shell: Shell = build_shell(cells, 1.0, 0.2, 0.3, D, 2.0, len(flat))
     turned = flat @ np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
     bent = np.column_stack([np.sin(kappa * turned[:, 0]) / kappa, turned[:, 1], np.cos(kappa * turned[:, 0]) / kappa])
-    from design.deploy.newton import fold_angles
-
     energy = 0.5 * shell.fold_mJ * fold_angles(bent, shell.hinges) ** 2
     side = flat[shell.hinges[:, 1]] - flat[shell.hinges[:, 0]]
     turn = np.rint(np.arctan2(side[:, 1], side[:, 0]) / (np.pi / 3)).astype(int) % 3
@@ -182,6 +180,7 @@ def solver_check() -> list[Figure]:
         found = from_flat(layout)
         percent = 100 * sphere_deviation_mm(found.x_mm, layout)[0] / diagonal
         figures.append(_deviation(f"cap, {name}", percent, asked, len(layout.cells)))
+        figures.append(_bending_cost(f"cap, {name}", layout, found))
     for target, limit in (("double_dome", 0.30), ("lilium_tower", 1.5)):
         mesh = published(target)
         if mesh is None:
@@ -231,9 +230,18 @@ def _every_shape(name: str, layout: Layout, goal: Reals, mesh: TriMesh, asked: f
     energies = ", ".join(f"{s.equilibrium.energy_mJ:.3f} mJ: {r:.2f} %" for s, r in zip(shapes, rows, strict=True))
     return [
         _deviation(name, min(rows), asked, len(layout.cells)),
+        _bending_cost(f"{name}, closest", layout, shapes[int(np.argmin(rows))].equilibrium),
         Figure(f"{name}: every equilibrium", energies, "", "reported", None, len(shapes)),
         Figure(f"{name}: starts without an answer", len(lost), "", "", None, len(lost) + len(shapes)),
     ]
+
+
+def _bending_cost(name: str, layout: Layout, found: Equilibrium) -> Figure:
+    """Return the energy that bending costs, of the whole."""
+    shell = layout.shell()
+    bent_mJ = 0.5 * float(shell.fold_mJ @ fold_angles(found.x_mm, shell.hinges) ** 2)
+    told = f"{bent_mJ:.3f} of {found.energy_mJ:.3f}"
+    return Figure(f"{name}: what bending costs", told, "mJ", "reported", None, len(layout.cells))
 
 
 def _deviation(name: str, percent: float, asked: float | None, n: int) -> Figure:
@@ -346,7 +354,7 @@ def compensation() -> list[Figure]:
         held = standing(layout, goal, SHEET, support)
         heavy = solve_level(layout, goal, held.loads, held.fixed)
         found = compensate(layout, goal, bounds, standing=held)
-        rms = [sphere_rms_mm(e.x_mm, layout, held.aligned) for e in (heavy, found.equilibrium)]
+        rms = [sphere_rms_mm(e.x_mm, held.aligned) for e in (heavy, found.equilibrium)]
         figures += _gains(f"heavy cap, rim {support}", found, *rms)
     return figures
 

@@ -46,6 +46,11 @@ class Laid:
     theta_rad: Reals
     library: CellLibrary  # of this sheet
 
+    @property
+    def goal_mm(self) -> Reals:
+        """Return where each vertex belongs as far as the folder tells, `(n, 3)`."""
+        return self.start_mm if self.design_mm is None else self.design_mm
+
 
 def read_laid(folder: Path, home: Path) -> Laid:
     """Return the shell of a design folder; raise `BundleError`, or `RefusedError` where it was built without one."""
@@ -144,7 +149,7 @@ def _places_apart_mm(corners_mm: Reals, faces: NDArray[np.int64]) -> Reals:
     high = -low
     np.minimum.at(low, faces.ravel(), corners_mm.reshape(-1, 2))
     np.maximum.at(high, faces.ravel(), corners_mm.reshape(-1, 2))
-    return high - low
+    return np.asarray(high - low, dtype=np.float64)
 
 
 def _goal_mm(layout: Layout, paper: TriMesh, target: TriMesh) -> Reals:

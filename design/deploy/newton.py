@@ -24,6 +24,7 @@ from design.errors import NotConverged
 
 TOLERANCE_RATIO = 1e-9  # a tenth of what is promised, max‖force‖ over median k_d times side
 FIRST_SHIFT_RATIO = 1e-4  # of median k_d; small against any bending mode of one unit
+LARGEST_SHIFT_RATIO = 1e20  # of the first shift: no finite Hessian needs that
 LONGEST_STEP_RATIO = 0.6  # of a unit's deployed side, per vertex: further than that the quadratic model is fiction
 LINE_SEARCH_STEPS = 30
 SETTLED_RATIO = 1e-5  # of a unit's side: the Hessian changes by about this much over such a step
@@ -166,6 +167,10 @@ def _convex(system: System, matrix: sp.csc_matrix, x: Reals, shift: float, first
         if found is not None:
             return found, shift
         shift = max(4 * shift, first_shift)
+        if shift > LARGEST_SHIFT_RATIO * first_shift:
+            raise NotConverged(
+                "the deployed shape", float("nan"), 0, "its stiffness is no number: a unit has collapsed"
+            )
 
 
 def pins(x_mm: Reals) -> NDArray[np.bool_]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,6 +90,25 @@ def turned_over(layout: Layout, x_mm: Reals, bump: Ints, side: float) -> Reals:
     near = np.exp(-2 * np.sum((flat - centre) ** 2, axis=1) / width**2)
     stretch = float(layout.expansion_ratio[bump].mean())
     return np.asarray(x_mm + side * BUMP_HEIGHT_RATIO * stretch * width * near[:, None] * normal)
+
+
+def hinted(layout: Layout, x_mm: Reals, hints: Sequence[tuple[float, float, float]]) -> Equilibrium:
+    """Return the rest of a sheet near `x_mm` whose bumps are pushed to given sides: hints are (x_mm, y_mm, side ±1).
+
+    Places count from the middle of the flat's box, as a specification's regions do; each means the bump nearest to it,
+    and +1 the side that units run counter-clockwise to. One after the other, each from the rest before it. Where there
+    is no bump, `ValueError`; a bump that does not stay on its side shows in the shape and its energy.
+    """
+    places, centre = bumps(layout), layout.corners_mm.mean(axis=1)
+    if not places:
+        raise ValueError("the sheet has no bump that could stand to either side")
+    middle = 0.5 * (layout.corners_mm.min(axis=(0, 1)) + layout.corners_mm.max(axis=(0, 1)))
+    for x, y, side in hints:
+        away = np.linalg.norm(centre - middle - [x, y], axis=1)
+        bump = min(places, key=lambda group: float(away[group].min()))
+        rest = solve_level(layout, turned_over(layout, x_mm, bump, side))
+        x_mm = rest.x_mm
+    return rest
 
 
 def _designed_starts(layout: Layout, design_mm: Reals) -> dict[str, Reals]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from types import FrameType
@@ -20,6 +22,7 @@ from fabctl.errors import BUG, DONE, OPERATOR, Stopped
 from fabctl.events import Emit, Event
 from fabctl.workspace import Workspace, workspace
 
+TOGETHER_S = 0.5  # signals nearer than that are one
 ERASE_TO_END = "\x1b[K"  # of the terminal's line, from the cursor
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -33,6 +36,7 @@ bench_option = click.option(
     show_default=True,
     help="Bench file or its name.",
 )
+PLACE_MM = click.FloatRange(-10_000, 10_000)  # of anything on a bench
 MATERIAL = config_names("materials")
 
 
@@ -118,8 +122,22 @@ def progress() -> Emit:
     return listen
 
 
-def _terminate(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+def _interrupted_once() -> Callable[[int, FrameType | None], None]:
+    """Return a handler that raises `KeyboardInterrupt`, once for signals that come together.
+
+    A process group's SIGTERM reaches a flow's step twice, from its sender and from the flow, and a hand presses Ctrl-C
+    twice: the second must not break off the record of how the first ended.
+    """
+    heard_s = -math.inf
+
+    def hear(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal heard_s
+        now_s = time.monotonic()
+        together, heard_s = now_s - heard_s < TOGETHER_S, now_s
+        if not together:
+            raise KeyboardInterrupt
+
+    return hear
 
 
 def run_to_the_end(command: click.Command) -> int:
@@ -127,6 +145,9 @@ def run_to_the_end(command: click.Command) -> int:
 
     A second Ctrl-C may come at any moment of the way out: it must not change the exit code.
     """
+    hear = _interrupted_once()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, hear)
     try:
         try:
             return run_guarded(command)
@@ -144,7 +165,6 @@ def _deafen() -> None:
 
 def run_guarded(command: click.Command) -> int:
     """Run `command` and return its exit code (`fabctl.errors` lists them)."""
-    signal.signal(signal.SIGTERM, _terminate)
     try:
         code = command.main(prog_name="fabctl", standalone_mode=False)
         return int(code) if isinstance(code, int) else DONE

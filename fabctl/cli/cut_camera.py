@@ -64,7 +64,13 @@ def _is_registration(path: Path) -> bool:
 @click.option(
     "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives power and speed."
 )
-@click.option("--origin", type=click.Choice(["home", "here"]), default="home", show_default=True)
+@click.option(
+    "--origin",
+    type=click.Choice(["home", "here"]),
+    default="home",
+    show_default=True,
+    help="Where the board's corner lies: in the corner of the travel, or where the head is.",
+)
 @click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
 @bench_option
 @yes_option

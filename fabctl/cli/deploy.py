@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from fabctl.deploying import Laid
     from fabctl.events import Emit
 
+PLACE_MM = click.FloatRange(-100_000, 100_000)
+
 
 @click.command()
 @click.argument("design", type=InFolder())
@@ -30,9 +32,21 @@ if TYPE_CHECKING:
     show_default=True,
     help="What the rim stands on, with --gravity.",
 )
-@click.option("--friction", type=click.FloatRange(0), default=0.5, show_default=True, help="Coefficient for coulomb.")
+@click.option(
+    "--friction", type=click.FloatRange(0, 10), default=0.5, show_default=True, help="Coefficient for coulomb."
+)
 @click.option("--level-floor", is_flag=True, help="A level floor instead of a bed made to the rim.")
-@click.option("--shapes", type=click.IntRange(0), default=0, help="Look for other equilibria from this many starts.")
+@click.option(
+    "--shapes", type=click.IntRange(0, 10_000), default=0, help="Look for other equilibria from this many starts."
+)
+@click.option(
+    "--hint",
+    "hints",
+    type=(PLACE_MM, PLACE_MM, click.Choice(["up", "down"])),
+    multiple=True,
+    metavar="X Y up|down",
+    help="Push the bump at X, Y (mm from the middle of the cells' box) to a side; may be given again.",
+)
 @click.option("--parts", type=click.IntRange(1, 6), default=1, show_default=True, help="Triangles along a unit's side.")
 @click.option(
     "--compensate",
@@ -50,6 +64,7 @@ def command(
     friction: float,
     level_floor: bool,
     shapes: int,
+    hints: tuple[tuple[float, float, str], ...],
     parts: int,
     compensate: bool,
     by_unit: bool,
@@ -69,7 +84,7 @@ def command(
     laid = read_laid(design, lab().root)
     laid = divided(laid, parts) if parts > 1 else laid
     emit(Event("stage", f"deploying {len(laid.layout.cells)} units"))
-    popped = deploy(laid.layout, laid.target, laid.start_mm if laid.design_mm is None else laid.design_mm)
+    popped = _from_hints(laid, hints) if hints else deploy(laid.layout, laid.target, laid.goal_mm)
     settled = None
     if gravity:
         emit(Event("stage", f"its weight acts; rim: {support}"))
@@ -86,6 +101,19 @@ def command(
     facts["folder"] = str(folder)
     _write(folder, laid, popped, settled, animation, facts)
     show(facts, as_json, _lines(facts))
+
+
+def _from_hints(laid: Laid, hints: tuple[tuple[float, float, str], ...]) -> Deployed:
+    """Return the shape in which the bumps at some places are pushed to given sides."""
+    from design.deploy.predict import compared
+    from design.deploy.search import hinted
+
+    sides = [(x, y, 1.0 if side == "up" else -1.0) for x, y, side in hints]
+    try:
+        rest = hinted(laid.layout, laid.goal_mm, sides)
+    except ValueError as fault:
+        raise click.UsageError(f"--hint: {fault}") from fault
+    return compared(laid.layout, rest, laid.target, laid.goal_mm)
 
 
 def _facts(popped: Deployed, parts: int) -> dict[str, Any]:

@@ -25,7 +25,7 @@ command.add_command(coupon_read)
 @command.command()
 @click.argument("spec", type=config_names("specs"))
 @click.option("--target", type=InFile(), help="Mesh to use instead of the specification's.")
-@click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell, instead of the specification's.")
+@click.option("--cell-mm", type=click.FloatRange(0.1, 1000), help="Edge of a cell, instead of the specification's.")
 @library_option
 @click.option("-o", "--output", type=OutFolder(), help="Design folder to write [out/NAME].")
 @click.option("--replace", is_flag=True, help="Replace a design that lies in that folder.")
@@ -73,7 +73,7 @@ def build(
 @click.option(
     "--material", type=MATERIAL, help="Material file or its name, for a mesh or surface [natural-rubber-2.3]."
 )
-@click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell [the material's].")
+@click.option("--cell-mm", type=click.FloatRange(0.1, 1000), help="Edge of a cell [the material's].")
 @library_option
 @click.option("--cells", type=click.Choice(["expanding", "contracting"]),
               help="Kind of cells, for a mesh or surface [expanding].")  # fmt: skip

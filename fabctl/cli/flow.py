@@ -28,8 +28,20 @@ from fabctl.flow import Flow, Order, continued, runner, steps_after_deployment, 
     show_default=True,
     help="How it is pressed: file, or name in configs/methods.",
 )
-@click.option("--tolerance-frac", type=float, default=0.02, show_default=True, help="Of the target's diagonal.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Same seed, same scan and same answer.")
+@click.option(
+    "--tolerance-frac",
+    type=click.FloatRange(0, 10, min_open=True),
+    default=0.02,
+    show_default=True,
+    help="Of the target's diagonal.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    default=0,
+    show_default=True,
+    help="Same seed, same scan and same answer.",
+)
 @bench_option
 @yes_option
 @json_option

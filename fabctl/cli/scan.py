@@ -42,7 +42,13 @@ def command() -> None:
     show_default=True,
     help="The cloud's scale: found from geometry, given by --unit-mm, or taken from a measured board.",
 )
-@click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
+@click.option(
+    "--unit-mm",
+    type=click.FloatRange(0, 1e9, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Millimetres in one unit of the cloud, with --scale known.",
+)
 @click.option(
     "--markers",
     type=InFile(),
@@ -71,8 +77,14 @@ def command() -> None:
     show_default=True,
     help="Rules of the alignment.",
 )
-@click.option("--tolerance-frac", type=click.FloatRange(min=0, min_open=True), help="Of the bounding-box diagonal.")
-@click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same answer.")
+@click.option("--tolerance-frac", type=click.FloatRange(0, 10, min_open=True), help="Of the bounding-box diagonal.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    default=0,
+    show_default=True,
+    help="The same seed gives the same answer.",
+)
 @bench_option
 @json_option
 def run_scan(
@@ -141,10 +153,28 @@ def run_scan(
 @command.command("batch")
 @click.argument("clouds", nargs=-1, required=True, type=InFile())
 @click.option("--target", type=InFile(), required=True, help="Target mesh of all the clouds.")
-@click.option("--scale", type=click.Choice(["free", "known"]), default="free", show_default=True)
-@click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
-@click.option("--tolerance-frac", type=click.FloatRange(min=0, min_open=True), help="Of the bounding-box diagonal.")
-@click.option("--seed", type=int, default=0, show_default=True)
+@click.option(
+    "--scale",
+    type=click.Choice(["free", "known"]),
+    default="free",
+    show_default=True,
+    help="The clouds' scale: found from geometry, or given by --unit-mm.",
+)
+@click.option(
+    "--unit-mm",
+    type=click.FloatRange(0, 1e9, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Millimetres in one unit of the cloud, with --scale known.",
+)
+@click.option("--tolerance-frac", type=click.FloatRange(0, 10, min_open=True), help="Of the bounding-box diagonal.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    default=0,
+    show_default=True,
+    help="The same seed gives the same answer.",
+)
 @json_option
 def run_batch(
     clouds: tuple[Path, ...],

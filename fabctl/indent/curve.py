@@ -21,6 +21,7 @@ SMOOTH_MM = 0.6  # half the width over which an extremum is fitted
 PROMINENCE_SIGMA = 6.0  # a peak must stand out of the noise by so much
 SNAP_SIGMA = 8.0  # a snap is a fall of the force between two samples of at least so many noises
 SNAP_RATE = 6.0  # and of at least so many times the steepest change elsewhere
+FOLLOWED_MM = 0.01  # a stage that went down by so much while holding has followed a force
 T95 = 1.96
 PRELOADED_SIGMA = 4.0  # a force of so many noises at the method's zero is a preload
 ENOUGH_COUNT = 36  # samples of a loading that its figures may rest on
@@ -41,6 +42,7 @@ class Strokes:
     hold_N: Reals = field(default_factory=lambda: np.zeros(0))
     zero_position_mm: float | None = None
     zero_N: float = 0.0
+    hold_position_mm: Reals = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,8 @@ class CurveResult:
     hysteresis_ratio: float | None = None
     barrier_mJ: float | None = None
     relaxation_ratio: float | None = None
+    creep_mm: float | None = None
+    creep_ratio: float | None = None
     residual_mm: float | None = None
     recovery_ratio: float | None = None
     reasons: dict[str, str] = field(default_factory=dict)
@@ -108,7 +112,7 @@ def analyse_curve(strokes: Strokes, compliance_mm_N: float = 0.0, secant_mm: flo
     found |= _energies(depth, load_N, back, unload_N, reasons)
     found |= _barrier(depth, load_N, contact.noise_N, found, reasons)
     found |= _recovery(depth, back, unload_N, contact.noise_N, reasons)
-    found |= _relaxation(strokes, free_N, reasons)
+    found |= _held(strokes, free_N, contact.position_mm, compliance_mm_N, reasons)
     return CurveResult(
         contact,
         depth_max_mm=float(depth.max()),
@@ -321,16 +325,26 @@ def _recovery(depth: Reals, back: Reals, unload_N: Reals, noise_N: float, reason
     return {"residual_mm": free.position_mm, "recovery_ratio": 1.0 - free.position_mm / float(depth.max())}
 
 
-def _relaxation(strokes: Strokes, free_N: float, reasons: dict[str, str]) -> dict[str, object]:
-    """Return which share of the force is lost while the stage holds."""
+def _held(
+    strokes: Strokes, free_N: float, contact_mm: float, compliance_mm_N: float, reasons: dict[str, str]
+) -> dict[str, object]:
+    """Return which share of the force is lost where the stage stands, or how far it follows a force that is kept."""
     count = len(strokes.hold_N)
     if count < 20:
-        return _none(reasons, "the method holds nowhere, or too shortly", "relaxation_ratio")
+        why = "the method holds nowhere, or too shortly"
+        return _none(reasons, why, "relaxation_ratio", "creep_mm", "creep_ratio")
     edge = max(3, count // 50)
-    begin, end = float(np.mean(strokes.hold_N[:edge])) - free_N, float(np.mean(strokes.hold_N[-edge:])) - free_N
+    begin, end = (float(np.mean(part)) - free_N for part in (strokes.hold_N[:edge], strokes.hold_N[-edge:]))
     if begin <= 0:
-        return _none(reasons, "no force is held", "relaxation_ratio")
-    return {"relaxation_ratio": (begin - end) / begin}
+        return _none(reasons, "no force is held", "relaxation_ratio", "creep_mm", "creep_ratio")
+    place = strokes.hold_position_mm
+    if len(place) != count or place[-1] - place[0] < FOLLOWED_MM:
+        _none(reasons, "the stage stood: the force relaxed, nothing crept", "creep_mm", "creep_ratio")
+        return {"relaxation_ratio": (begin - end) / begin}
+    depth = place - compliance_mm_N * strokes.hold_N - contact_mm
+    first, last = float(np.mean(depth[:edge])), float(np.mean(depth[-edge:]))
+    _none(reasons, "the force was kept: the specimen crept", "relaxation_ratio")
+    return {"creep_mm": last - first, "creep_ratio": (last - first) / first if first > 0 else None}
 
 
 def _smooth(depth: Reals, force_N: Reals, half_mm: float) -> Reals:

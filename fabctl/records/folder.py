@@ -12,6 +12,7 @@ import json
 import os
 import platform
 import secrets
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -157,9 +158,13 @@ class RunFolder:
         write_atomically(self.path / "result.json", as_json(dict(result)))
 
     def finish(self, status: str, message: str = "", **details: Any) -> None:
-        """Close the run: `status` is done, stopped, failed or refused."""
+        """Close the run: `status` is done, stopped, failed or refused. An interrupt meanwhile comes afterwards."""
         body = {"status": status, "message": message, "finished_utc": _utc().isoformat(), **details}
-        write_atomically(self.path / "outcome.json", as_json(body))
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+        try:
+            write_atomically(self.path / "outcome.json", as_json(body))
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def start_run(

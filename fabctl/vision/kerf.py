@@ -154,7 +154,7 @@ def _coupon_to_pixels(markers: Sequence[Marker], sheet: MarkSheet) -> F64:
 def _layout_findings(H: F64, markers: Sequence[Marker], sheet: MarkSheet, source: str) -> list[Finding]:
     """Return an error where the marks do not lie as the coupon's: it is another one, or the picture is bent."""
     pairs = [(marker, mark) for marker in markers if (mark := sheet.mark(marker.id)) is not None]
-    seen = warp(np.linalg.inv(H), np.array([marker.centre_px for marker, _ in pairs]))
+    seen = warp(np.asarray(np.linalg.inv(H), dtype=np.float64), np.array([marker.centre_px for marker, _ in pairs]))
     off_mm = float(np.linalg.norm(seen - np.array([mark.centre_mm for _, mark in pairs]), axis=1).max())
     if off_mm <= MOST_MISPLACED_MM:
         return []

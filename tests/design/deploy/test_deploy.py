@@ -100,6 +100,13 @@ def test_too_few_iterations_are_an_error_with_the_residual(cap) -> None:
     assert refused.value.residual_ratio > 1e-9
 
 
+def test_a_start_that_is_no_shape_is_an_error_and_not_a_loop(cap) -> None:
+    nowhere = np.array(cap.design_mm)
+    nowhere[0] = np.nan
+    with pytest.raises(NotConverged):
+        solve(System(cap.layout.shell()), nowhere)
+
+
 def test_a_pressed_cap_pushes_back_and_recovers(cap, popped) -> None:
     response = indentation_response(cap.layout, popped.mesh.vertices_mm, 8.0, 2.0, steps_count=4, parts=1)
     assert response.load_N[0] == pytest.approx(0, abs=1e-9)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from design.deploy.equilibrium import solve_level
 from design.deploy.levels import Layout
-from design.deploy.search import bumps, equilibria, turned_over
+from design.deploy.search import bumps, equilibria, hinted, same_shape, turned_over
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +25,22 @@ def test_places_that_dome_are_told_from_saddles(dumbbell) -> None:
     found = bumps(dumbbell)
     centres = [dumbbell.corners_mm[group].mean(axis=(0, 1)) for group in found[:2]]
     assert sorted(c[0] for c in centres) == pytest.approx([-36, 36], abs=8)
+
+
+def test_a_hint_pushes_the_bump_at_its_place_to_its_side(dumbbell) -> None:
+    flat = dumbbell.flat_mm()
+    design = np.column_stack(
+        [1.2 * flat, sum(18 * np.exp(-np.sum((flat - [x, 0]) ** 2, axis=1) / 400) for x in (-36, 36))]
+    )
+    both_up = solve_level(dumbbell, design)
+    again = hinted(dumbbell, design, [(-36.0, 0.0, 1.0), (36.0, 0.0, 1.0)])
+    assert again.energy_mJ == pytest.approx(both_up.energy_mJ, rel=1e-6)
+    one_down = hinted(dumbbell, design, [(30.0, 5.0, -1.0)])
+    assert one_down.stable
+    assert one_down.energy_mJ > 1.02 * both_up.energy_mJ
+    mirrored = hinted(dumbbell, design, [(-30.0, 5.0, -1.0)])
+    assert mirrored.energy_mJ == pytest.approx(one_down.energy_mJ, rel=1e-3)
+    assert not same_shape(mirrored.x_mm, one_down.x_mm)
 
 
 def test_a_bump_turned_over_is_another_equilibrium(dumbbell) -> None:
