@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks import Figure
 from benchmarks._readback import read_dxf, read_gcode, read_svg
+from benchmarks._travel_bound import bound_mm
 from design.export.dxf import dxf
 from design.export.gcode import LINE_LIMIT, gcode
 from design.export.svg import svg
@@ -77,6 +78,20 @@ def _timed(work: Callable[[], NDArray[np.int64]]) -> tuple[NDArray[np.int64], fl
     began = time.process_time()
     result = work()
     return result, time.process_time() - began
+
+
+def bound_figures() -> list[Figure]:
+    """Return for each length of stroke the bound over greedy, and how far above it the order found lies."""
+    figures = []
+    for stroke_mm in (*OTHER_STROKES_MM[:2], STROKE_MM, OTHER_STROKES_MM[-1]):
+        ends = random_strokes(stroke_mm)
+        greedy_mm, found_mm = travel_mm(ends, greedy_with_flips(ends)), travel_mm(ends, tour(ends))
+        bound = bound_mm(ends, found_mm)
+        name = f"strokes of {stroke_mm:g} mm"
+        figures.append(Figure(f"bound over greedy, {name}", round(bound / greedy_mm, 4), "", "", None, COUNT))
+        above = round(100 * (found_mm / bound - 1), 2)
+        figures.append(Figure(f"found above the bound, {name}", above, "%", "", None, COUNT))
+    return figures
 
 
 def nesting_figure() -> Figure:
@@ -152,5 +167,7 @@ def export_figures() -> list[Figure]:
 
 
 def measure(words: list[str]) -> list[Figure]:
-    """Return all figures of the toolpath."""
+    """Return all figures of the toolpath, or with `--bound` what no order of the random strokes can beat."""
+    if words[:1] == ["--bound"]:
+        return bound_figures()
     return [*travel_figures(), nesting_figure(), *kerf_figures(), *export_figures()]

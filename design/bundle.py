@@ -125,7 +125,7 @@ def write_bundle(design: Design, spec_text: str, path: Path, replace: bool = Fal
 
 
 def write_coupon_bundle(
-    made: Coupon, job: Job, spec_text: str, library_hash: str, edge_mm: float, path: Path
+    made: Coupon, job: Job, spec_text: str, library_hash: str, edge_mm: float, path: Path, replace: bool = False
 ) -> Bundle:
     """Write a coupon's folder, which is cut as a design's is, and return it."""
     about = {"name": "coupon", "kind": "coupon", "library": library_hash, "facts": coupon_facts(made, job, edge_mm)}
@@ -136,7 +136,7 @@ def write_coupon_bundle(
             (folder / name).write_text(text, encoding="utf-8")
         (folder / "preview.png").write_bytes(coupon_png(made))
 
-    return _write_whole(path, False, about, fill)
+    return _write_whole(path, replace, about, fill)
 
 
 def _write_whole(path: Path, replace: bool, about: Mapping[str, Any], fill: Callable[[Path], None]) -> Bundle:

@@ -98,3 +98,15 @@ def as_cut(library: CellLibrary, choice: Choice, hinge_mm: Array) -> tuple[Choic
         text = f"{int((~known).sum())} cells are not known to stay open with their hinge; taken as with the library's"
         findings.append(Finding("HINGE-UNKNOWN", text, "warning", hint="take narrower hinges, or another rule"))
     return Choice(choice.t_mm, choice.theta_rad, expansion, stiffness, barrier), findings
+
+
+def hinge_range(base: CellLibrary, library: CellLibrary) -> list[Finding]:
+    """Return between which expansions cells are known to stay open with the design's hinges, if not the library's."""
+    if library is base:
+        return []
+    (low, high), (own_low, own_high) = library.range_ratio(), base.range_ratio()
+    text = (
+        f"with hinges of about {library.sheet.hinge_mm:.3g} mm cells are known to stay open from {low:.3f} to "
+        f"{high:.3f}, with the library's {base.sheet.hinge_mm:.3g} mm from {own_low:.3f} to {own_high:.3f}"
+    )
+    return [Finding("HINGE-RANGE", text, "info")]

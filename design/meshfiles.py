@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -186,10 +187,16 @@ def write_stl(path: Path | str, mesh: TriMesh) -> None:
 
 
 def write_mesh(path: Path | str, mesh: TriMesh) -> None:
-    """Write the mesh in the format its name asks for."""
+    """Write the mesh in the format its name asks for, whole or not at all."""
     writers: dict[str, Callable[[Path, TriMesh], None]] = {".ply": write_ply, ".obj": write_obj, ".stl": write_stl}
     path = Path(path)
     if path.suffix.lower() not in writers:
         text = f"meshes are OBJ, PLY or STL, not `{path.suffix}`"
         raise UnreadableMesh(f"{path}: {text}", [Finding("FILE-FORMAT", text)])
-    writers[path.suffix.lower()](path, mesh)
+    draft = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    try:
+        writers[path.suffix.lower()](draft, mesh)
+        draft.replace(path)
+    except OSError as fault:  # a full disk: what is there cannot be told from a mesh
+        draft.unlink(missing_ok=True)
+        raise OSError(fault.errno, fault.strerror, str(path)) from fault

@@ -20,7 +20,7 @@ from design.errors import OutOfLibrary
 from design.findings import Finding
 from design.flatten import Flattening, Limits, feasibility, flatten
 from design.flatten.ladder import Remedy
-from design.hinged import Widening, as_cut, hinged, widening
+from design.hinged import Widening, as_cut, hinge_range, hinged, widening
 from design.job import Job, JobOptions, compose_job
 from design.limits import check_count
 from design.pattern.assign import averaged, factor
@@ -112,6 +112,7 @@ def build(
     watch("flattening the surface", 0.0)
     found = list(findings)
     base, library, curve, wide = cells_on_offer(spec, library)
+    found += hinge_range(base, library)
     flat = lay_flat(spec, mesh, curve, found)
     watch("choosing cells", 0.2)
     flat, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)

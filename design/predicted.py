@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from design.cells.bending_map import bending_for
+from design.cells.contracting import is_contracting
 from design.cells.library import CellLibrary
 from design.cells.select import Choice
 from design.deploy.equilibrium import from_flat, pushed_flat
@@ -26,6 +27,7 @@ from design.pattern.tiling import Array, Tiling
 from design.spec import ResponseOptions
 
 FROM_FLAT_COUNT = 2000  # units up to which the free deployment is computed too, in a second or so
+HINGE_RATIO, HINGE_FAR_RATIO = 0.04, 0.25  # a hinge further than that from the computed cells' is told, is a warning
 THICKNESS_RATIO = 0.05  # thickness over edge further than that from the computed cells' is told
 
 
@@ -103,18 +105,25 @@ def welded(layout: Layout, tiling: Tiling, design_mm: Array) -> tuple[Layout, Ar
 def _doubts(library: CellLibrary) -> list[Finding]:
     """Return what makes the prediction less sure."""
     computed, sheet = bending_for(library).sheet, library.sheet
+    found = []
     asked, known = sheet.thickness_mm / sheet.edge_mm, computed.thickness_mm / computed.edge_mm
-    if abs(asked / known - 1) < THICKNESS_RATIO:
-        return []
-    return [
-        Finding(
-            "DEPLOY-THICKNESS",
+    if abs(asked / known - 1) >= THICKNESS_RATIO:
+        text = (
             f"bending stiffness was computed for a thickness of {known:.3g} of the cell's edge; yours is {asked:.3g}, "
-            "and is scaled with the cube of the thickness",
-            "warning",
-            hint="shape and response are less sure; `scripts/build_bending.py` computes the map anew",
+            "and is scaled with the cube of the thickness"
         )
-    ]
+        hint = "shape and response are less sure; `scripts/build_bending.py` computes the map anew"
+        found.append(Finding("DEPLOY-THICKNESS", text, "warning", hint=hint))
+    mine, theirs = sheet.hinge_mm / sheet.edge_mm, computed.hinge_mm / computed.edge_mm
+    if not is_contracting(library) and abs(mine / theirs - 1) >= HINGE_RATIO:
+        far = abs(mine / theirs - 1) > HINGE_FAR_RATIO
+        off = "a quarter less at low expansions, a tenth more at high ones" if far else "a twentieth either way"
+        text = (
+            f"bending stiffness is that of hinges of {theirs * sheet.edge_mm:.3g} mm; with yours of about "
+            f"{sheet.hinge_mm:.3g} mm it may be up to {off}"
+        )
+        found.append(Finding("DEPLOY-HINGE", text, "warning" if far else "info", hint="take the response with care"))
+    return found
 
 
 def layout_of(tiling: Tiling, choice: Choice, cut: NDArray[np.bool_], library: CellLibrary) -> Layout:

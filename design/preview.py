@@ -15,6 +15,7 @@ from design.pattern.tiling import Array
 from design.pipeline import Design
 
 WIDTH_INCHES, DPI = 10.0, 150
+TICKS_COUNT = 5  # intervals along the longest axis of a picture in space
 
 
 def preview_png(design: Design) -> bytes:
@@ -90,7 +91,18 @@ def _draw_deployed(axes: Any, design: Design) -> None:
     x, y, z = deployed.mesh.vertices_mm.T
     axes.plot_trisurf(x, y, z, triangles=deployed.mesh.faces, color="#d0b060", edgecolor="#80602080", linewidth=0.2)
     axes.set_aspect("equal")
+    few_ticks(axes)
     axes.set_title(f"deployed: {deployed.deviation.mean_mm:.2f} mm from the target on average", fontsize=9)
+
+
+def few_ticks(axes: Any) -> None:
+    """Thin the ticks of each axis of a picture in space by its length, so that no label lies on the next."""
+    from matplotlib.ticker import MaxNLocator
+
+    lengths = [abs(float(np.ptp(getattr(axes, f"get_{name}lim")()))) for name in "xyz"]
+    for name, length in zip("xyz", lengths, strict=True):
+        intervals = max(1, round(TICKS_COUNT * length / max(lengths)))
+        getattr(axes, f"{name}axis").set_major_locator(MaxNLocator(intervals, min_n_ticks=1))
 
 
 def _draw_response(axes: Any, design: Design) -> None:

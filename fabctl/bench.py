@@ -25,6 +25,7 @@ from fabctl.records.folder import person, write_atomically
 from fabctl.workspace import Workspace
 
 READY = "ready:"
+HELD = "FABCTL_BENCH_HELD"  # the open lock that a flow hands down to its steps, by number
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Bench:
 
     config: BenchConfig
     state: Path
+    lock: int = -1
 
     def url(self, device: str) -> str:
         """Return the URL of `laser`, `rig` or `camera`; raise `UsageError` where the bench has none."""
@@ -92,10 +94,15 @@ def open_bench(lab: Workspace, config: BenchConfig, purpose: str) -> Iterator[Be
     """Hold the bench for one job; raise `BenchBusy` saying who has it, for what, since when.
 
     The lock is the operating system's: it ends with the process, however that ends, and counts for everybody on this
-    machine who names the same devices.
+    machine who names the same devices. A step of a flow works under the flow's own lock.
     """
     state = lab.bench_state(config.name)
-    handle = os.open(_lock_path(config, state), os.O_RDWR | os.O_CREAT, 0o666)
+    place = _lock_path(config, state)
+    handed = _handed_down(place)
+    if handed is not None:
+        yield Bench(config, state, handed)
+        return
+    handle = os.open(place, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -105,9 +112,22 @@ def open_bench(lab: Workspace, config: BenchConfig, purpose: str) -> Iterator[Be
         since = datetime.now(UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
         os.ftruncate(handle, 0)
         os.pwrite(handle, f"{person()} (process {os.getpid()}): {purpose}, since {since}".encode(), 0)
-        yield Bench(config, state)
+        yield Bench(config, state, handle)
     finally:
         os.close(handle)
+
+
+def _handed_down(place: Path) -> int | None:
+    """Return the open lock of this bench that the process inherited from a flow, or None.
+
+    The number alone proves nothing: it must be this bench's file, and the lock of whoever opened it.
+    """
+    with contextlib.suppress(ValueError, OSError):
+        handle = int(os.environ.get(HELD, ""))
+        if os.path.samestat(os.fstat(handle), place.stat()):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return handle
+    return None
 
 
 def _lock_path(config: BenchConfig, state: Path) -> Path:

@@ -22,6 +22,7 @@ from design.deploy.levels import Layout, prolong, refine
 from design.deploy.shell import Reals
 from design.findings import Finding
 from design.meshfiles import read_mesh
+from design.preview import few_ticks
 from design.surface import TriMesh
 from fabctl.config.material import load_material
 from fabctl.config.spec import load_spec
@@ -148,7 +149,7 @@ def _places_apart_mm(corners_mm: Reals, faces: NDArray[np.int64]) -> Reals:
     high = -low
     np.minimum.at(low, faces.ravel(), corners_mm.reshape(-1, 2))
     np.maximum.at(high, faces.ravel(), corners_mm.reshape(-1, 2))
-    return np.asarray(high - low)
+    return np.asarray(high - low, dtype=np.float64)
 
 
 def _goal_mm(layout: Layout, paper: TriMesh, target: TriMesh) -> Reals:
@@ -215,5 +216,6 @@ def _stage(mesh: TriMesh, title: str):  # type: ignore[no-untyped-def]  # matplo
     for k, name in enumerate("xyz"):
         getattr(axes, f"set_{name}lim")(middle[k] - reach, middle[k] + reach)
         getattr(axes, f"set_{name}label")(f"{name}, mm")
+    few_ticks(axes)
     axes.set_title(title)
     return figure, axes, faces

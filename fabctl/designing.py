@@ -251,7 +251,7 @@ def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
     return {layer: LayerPreset(c.power_frac, c.feed_mm_s, c.passes_count) for layer, c in layers.items()}
 
 
-def write_coupon(folder: Path, asked: CouponConfig, home: Path) -> tuple[Coupon, Bundle]:
+def write_coupon(folder: Path, asked: CouponConfig, home: Path, replace: bool = False) -> tuple[Coupon, Bundle]:
     """Write a coupon's folder, which is cut as a design's is; return what is drawn, and the folder."""
     material = load_material(asked.material, home)
     presets = presets_of(material)
@@ -262,7 +262,7 @@ def write_coupon(folder: Path, asked: CouponConfig, home: Path) -> tuple[Coupon,
     made = coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), asked.hinges_mm, sheet)
     job = compose_job(made.drawing, presets, job_options(asked.tool, material.laser.kerf_mm), remarks=[asked.name])
     text = yaml.safe_dump(asked.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
-    return made, write_coupon_bundle(made, job, text, library.hash, sheet.edge_mm, folder)
+    return made, write_coupon_bundle(made, job, text, library.hash, sheet.edge_mm, folder, replace)
 
 
 def job_options(tool: ToolConfig, kerf_mm: float, machine: GcodeOptions | None = None) -> JobOptions:

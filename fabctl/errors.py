@@ -64,6 +64,18 @@ class BenchBusy(FabctlError):
     exit_code = DEVICE
 
 
+class ClusterAway(FabctlError):
+    """The machines that should share the work cannot be reached."""
+
+    exit_code = DEVICE
+
+
+class WorkerDied(FabctlError):
+    """A process that shared the work is gone; what was finished is kept."""
+
+    exit_code = DEVICE
+
+
 class Stopped(FabctlError):
     """The operator said stop. Not a failure."""
 

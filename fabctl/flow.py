@@ -18,6 +18,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from design.findings import Finding
+from fabctl.bench import HELD, Bench
 from fabctl.config.bench import BenchConfig
 from fabctl.errors import BUG, DONE, OPERATOR, OUT_OF_TOLERANCE, FabctlError, UsageError
 from fabctl.events import Emit, Event
@@ -29,9 +31,9 @@ Run = Callable[[Sequence[str]], tuple[int, dict[str, Any]]]
 class StepFailed(FabctlError):
     """A step ended with an error, which it has already explained; flow ends with the same exit code."""
 
-    def __init__(self, step: str, code: int, hint: str) -> None:
-        super().__init__(step, code, hint)
-        self.step, self.code, self.hint = step, code, hint
+    def __init__(self, step: str, code: int, hint: str, findings: Sequence[Finding] = ()) -> None:
+        super().__init__(step, code, hint, tuple(findings))
+        self.step, self.code, self.hint, self.findings = step, code, hint, tuple(findings)
         self.exit_code = code
 
     def __str__(self) -> str:
@@ -81,7 +83,7 @@ def steps_until_cut(lab: Workspace, order: Order, spec: Path, target: Path | Non
 def steps_after_deployment(order: Order, flow: Flow, run: Run, emit: Emit) -> Flow:
     """Indent, scan and report a specimen that stands deployed on the bench."""
     assert flow.specimen is not None
-    again = f"after mending: fabctl flow --continue {flow.specimen} --bench {order.bench_name}"
+    again = f"after mending: fabctl flow --continue {flow.specimen} --method {order.method} --bench {order.bench_name}"
     yes = ["--yes"] if order.yes else []
     words = ["indent", "run", flow.specimen, "--method", order.method, "--bench", order.bench_name, *yes]
     _step(flow, "indent", words, run, emit, again)
@@ -101,8 +103,11 @@ def continued(lab: Workspace, name: str) -> Flow:
     return Flow(name, str(specimen.design))
 
 
-def runner(lab: Workspace) -> Run:
-    """Return a function that runs one fabctl command in `lab` and returns its exit code and its JSON."""
+def runner(lab: Workspace, bench: Bench) -> Run:
+    """Return a function that runs one fabctl command in `lab` and returns its exit code and its JSON.
+
+    The steps work under the lock that the flow holds on `bench`, so that nobody's job comes between two of them.
+    """
 
     def run(words: Sequence[str]) -> tuple[int, dict[str, Any]]:
         command = [sys.executable, "-m", "fabctl", "--home", str(lab.root), *words, "--json"]
@@ -110,7 +115,11 @@ def runner(lab: Workspace) -> Run:
         with (
             _term_raises(),
             subprocess.Popen(
-                command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}
+                command,
+                stdout=subprocess.PIPE,
+                text=True,
+                env={**os.environ, "PYTHONPATH": path, HELD: str(bench.lock)},
+                pass_fds=(bench.lock,),
             ) as process,
         ):
             said = _wait(process)
@@ -158,12 +167,27 @@ def _step(flow: Flow, name: str, words: Sequence[str], run: Run, emit: Emit, hin
     if code not in (DONE, OUT_OF_TOLERANCE):
         if code == OPERATOR:
             raise StepFailed(name, OPERATOR, "stopped by the operator")
-        for finding in found.get("findings", []):  # said in its JSON, which nobody has seen
-            emit(Event("finding", f"{finding['level']} {finding['code']}: {finding['what']}"))
-        raise StepFailed(name, code if code > 0 else BUG, hint)
+        raise StepFailed(name, code if code > 0 else BUG, hint, _findings(found))
     flow.out_of_tolerance |= code == OUT_OF_TOLERANCE
     flow.steps[name] = found
     return found
+
+
+def _findings(found: dict[str, Any]) -> list[Finding]:
+    """Return what a step found, which it has told the person itself; flow passes it on to programs."""
+    return [
+        Finding(
+            row["code"],
+            row["what"],
+            row["level"],
+            row["where"],
+            row["remedy"] or "",
+            row["value"],
+            row["unit"] or "",
+            row["limit"],
+        )
+        for row in found.get("findings", [])
+    ]
 
 
 def _fresh_folder(parent: Path, stem: str) -> Path:

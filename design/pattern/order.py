@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from design.pattern.nearest_ends import nearest_ends
 from design.pattern.tiling import Array, Index
 
 NEAR_COUNT = 8  # neighbours looked at from every stroke end
@@ -22,7 +23,9 @@ FIRST_COUNT = 5  # ways tried at a chain's first link
 ROUNDS_COUNT, ROUND_GAIN_RATIO = 5, 0.004  # all ends are looked at again while a round still gains this much
 RUN_COUNT = 3  # strokes moved together at most
 KICK_COUNT = 30  # strokes in a run that a kick moves at most
-KICKS_BUDGET_COUNT = 4_000_000  # kicks times strokes: a kick costs more on a longer tour; about a second
+KICK_CHAIN_COUNT, KICK_FIRST_COUNT = 6, 2  # the same while a kick is repaired
+KICK_REACH_COUNT = 1000  # ends turned around in one exchange while a kick is repaired: more costs more than it gains
+KICKS_LIMIT_COUNT = 6000  # about a second, on 20,000 strokes a third of the whole
 GAIN_MM = 1e-7  # less is rounding
 
 
@@ -39,10 +42,13 @@ def tour(
         return np.arange(2 * count)
     home = np.tile(np.asarray(start_mm, dtype=np.float64), (2, 1))
     points = np.ascontiguousarray(np.vstack([ends_mm, home]))
-    near = _near(points)
-    order = _greedy(points, 2 * count)
-    kicks = kicks_count if kicks_count is not None else min(10 * count, KICKS_BUDGET_COUNT // count)
-    _improve(points, near, order, kicks, seed)
+    # Numbered as the first tour meets them, ends that are looked at together lie together in memory.
+    first = nearest_ends(points, 2 * count)
+    points = np.ascontiguousarray(points[first])
+    order = np.arange(len(first))
+    kicks = kicks_count if kicks_count is not None else min(10 * count, KICKS_LIMIT_COUNT)
+    _improve(points, _near(points), order, kicks, seed)
+    order = first[order]
     at = int(np.flatnonzero(order >= 2 * count)[0])
     # The two home ends are neighbours; at an even place, because strokes stay whole.
     return np.asarray(np.roll(order, -at)[2:])
@@ -63,7 +69,7 @@ def floor_mm(ends_mm: Array) -> float:
 def greedy_with_flips(ends_mm: Array, start_mm: tuple[float, float] = (0.0, 0.0)) -> Index:
     """Return the tour that always goes on to the nearest end left, `(2n,)`: what a simple sender does."""
     home = np.tile(np.asarray(start_mm, dtype=np.float64), (2, 1))
-    return np.asarray(_greedy(np.ascontiguousarray(np.vstack([ends_mm, home])), len(ends_mm))[2:])
+    return np.asarray(nearest_ends(np.ascontiguousarray(np.vstack([ends_mm, home])), len(ends_mm))[2:])
 
 
 def _near(points: Array) -> NDArray[np.int32]:
@@ -79,63 +85,6 @@ def _near(points: Array) -> NDArray[np.int32]:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _greedy(points: Array, first: int) -> Index:
-    """Return the tour by nearest ends from the stroke of end `first`; a grid of buckets finds the nearest."""
-    n = len(points)
-    low_x, low_y = points[:, 0].min(), points[:, 1].min()
-    width = max(points[:, 0].max() - low_x, points[:, 1].max() - low_y, 1e-9)
-    cells = max(1, int(math.sqrt(n / 2)))
-    size = width / cells * (1 + 1e-12)
-    bucket = np.empty(n, np.int64)
-    head = np.zeros(cells * cells + 1, np.int64)
-    for v in range(n):
-        cx, cy = min(cells - 1, int((points[v, 0] - low_x) / size)), min(cells - 1, int((points[v, 1] - low_y) / size))
-        bucket[v] = cy * cells + cx
-        head[bucket[v] + 1] += 1
-    for k in range(cells * cells):
-        head[k + 1] += head[k]
-    content = np.empty(n, np.int64)
-    place = np.empty(n, np.int64)
-    fill = head[:-1].copy()
-    for v in range(n):
-        place[v] = fill[bucket[v]]
-        content[place[v]] = v
-        fill[bucket[v]] += 1
-    live = fill  # buckets shrink from their end as ends are used
-    order = np.empty(n, np.int64)
-    here = first
-    for k in range(0, n, 2):
-        order[k], order[k + 1] = here, here ^ 1
-        for v in (here, here ^ 1):
-            b = bucket[v]
-            last = content[live[b] - 1]
-            content[place[v]], content[live[b] - 1] = last, v
-            place[last], place[v] = place[v], live[b] - 1
-            live[b] -= 1
-        at = here ^ 1
-        cx, cy = bucket[at] % cells, bucket[at] // cells
-        best, least = -1, np.inf
-        ring = 0
-        while ring <= cells and (best < 0 or (ring - 1) * size < least):
-            for gy in range(cy - ring, cy + ring + 1):
-                if gy < 0 or gy >= cells:
-                    continue
-                step = 1 if abs(gy - cy) == ring else max(1, 2 * ring)
-                for gx in range(cx - ring, cx + ring + 1, step):
-                    if gx < 0 or gx >= cells:
-                        continue
-                    b = gy * cells + gx
-                    for m in range(head[b], live[b]):
-                        v = content[m]
-                        d = math.hypot(points[v, 0] - points[at, 0], points[v, 1] - points[at, 1])
-                        if d < least:
-                            least, best = d, v
-            ring += 1
-        here = best
-    return order
-
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
 def _gap(points: Array, a: int, b: int) -> float:
     return math.hypot(points[a, 0] - points[b, 0], points[a, 1] - points[b, 1])
 
@@ -145,8 +94,8 @@ def _mate(order: Index, pos: Index, v: int) -> Any:
     """Return the end that `v` is linked to by travel."""
     n = len(order)
     p = pos[v]
-    q = p + 1 if p % 2 else p - 1
-    return order[q % n]
+    q = p + 1 if p & 1 else p - 1
+    return order[0 if q == n else n - 1 if q < 0 else q]
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -198,47 +147,120 @@ def _back_to(points: Array, order: Index, pos: Index, log: Index, kept: int) -> 
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _chain(points: Array, near: NDArray[np.int32], order: Index, pos: Index, log: Index, t1: int, first: int) -> float:
+def _was_added(log: Index, begun: int, a: int, b: int) -> bool:
+    """Say whether one end of a link was already moved in this chain: what was just linked is not unlinked again."""
+    found = False
+    for k in range(begun + 1, log[0, 0] + 1):
+        found |= log[k, 0] == a or log[k, 0] == b
+    return found
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _offer(top: Array, ends: Index, value: float, t3: int, t5: int) -> None:
+    """Keep an exchange among the most promising, best first."""
+    k = FIRST_COUNT - 1
+    if value <= top[k]:
+        return
+    while k > 0 and top[k - 1] < value:
+        top[k], ends[k, 0], ends[k, 1] = top[k - 1], ends[k - 1, 0], ends[k - 1, 1]
+        k -= 1
+    top[k], ends[k, 0], ends[k, 1] = value, t3, t5
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _exchanges(
+    points: Array, near: NDArray[np.int32], order: Index, pos: Index, log: Index, begun: int, t1: int,
+    gained: float, reach: int, top: Array, ends: Index,
+) -> None:  # fmt: skip
+    """Find the most promising exchanges that go on from the loose ends t1 and its mate t2.
+
+    A near t3 that is met the same way as t2 takes one exchange: its mate t4 becomes the loose end. One that is met the
+    other way would close t2 … t3 to a ring; the ring is opened again at a t5 near t4, whose mate becomes the loose end.
+    The last row is the exchange that gains most when the loose ends are linked at once, and that gain.
+    """
+    n = len(order)
+    top[:] = -np.inf
+    t2 = _mate(order, pos, t1)
+    step = 1 if pos[t1] & 1 else -1  # the way that leads from t2 away from t1
+    for m in range(near.shape[1]):
+        t3 = near[t2, m]
+        left = gained - _gap(points, t2, t3)
+        if left <= GAIN_MM:
+            return
+        t4 = _mate(order, pos, t3)
+        if t3 == t1 or _was_added(log, begun, t3, t4):
+            continue
+        span = (pos[t3] - pos[t2]) * step
+        if span < 0:
+            span += n
+        value = left + _gap(points, t3, t4)
+        if span & 1 == 0:
+            if min(span, n - span) <= reach:
+                _offer(top, ends, value, t3, -1)
+                closed = value - _gap(points, t1, t4)
+                if closed > top[FIRST_COUNT]:
+                    top[FIRST_COUNT], ends[FIRST_COUNT, 0], ends[FIRST_COUNT, 1] = closed, t3, -1
+            continue
+        if span > reach:
+            continue
+        for k in range(near.shape[1]):
+            t5 = near[t4, k]
+            rest = value - _gap(points, t4, t5)
+            if rest <= GAIN_MM:
+                break
+            inward = (pos[t5] - pos[t2]) * step
+            if inward < 0:
+                inward += n
+            if not 0 < inward < span:
+                continue
+            t6 = _mate(order, pos, t5)
+            if not _was_added(log, begun, t5, t6):
+                promise = rest + _gap(points, t5, t6)
+                _offer(top, ends, promise, t3, t5)
+                closed = promise - _gap(points, t1, t6)
+                if closed > top[FIRST_COUNT]:
+                    top[FIRST_COUNT], ends[FIRST_COUNT, 0], ends[FIRST_COUNT, 1] = closed, t3, t5
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _exchange(points: Array, order: Index, pos: Index, log: Index, t1: int, t3: int, t5: int) -> None:
+    """Make the exchange: t2 is linked with t3, and where there is a t5, t4 with it; t1 with what is loose then."""
+    t2 = _mate(order, pos, t1)
+    if t5 < 0:
+        _link(points, order, pos, log, t2, t3)
+        return
+    t6 = _mate(order, pos, t5)
+    if (pos[t5] - pos[t2]) % 2 == 0:  # both parts of the ring run the other way
+        _link(points, order, pos, log, t1, t6)
+        _link(points, order, pos, log, t2, t3)
+    else:  # they change places
+        _link(points, order, pos, log, t1, t3)
+        _link(points, order, pos, log, t1, t6)
+        _link(points, order, pos, log, t3, t2)
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _chain(
+    points: Array, near: NDArray[np.int32], order: Index, pos: Index, log: Index, t1: int, first: int, reach: int,
+    chain: int, top: Array, ends: Index,
+) -> float:  # fmt: skip
     """Try a chain of exchanges that begins by unlinking `t1`; return by how much the tour shrank.
 
-    Each step links the loose end t2 with a near t3 and takes t3's mate as the new loose end. The first step takes
-    the near end number `first`, the further ones the most promising. Only the best prefix stays.
+    The first step takes the exchange number `first`, the further ones the most promising. Only the best prefix stays.
     """
     gained = _gap(points, t1, _mate(order, pos, t1))
     best, begun = GAIN_MM, log[0, 0]
     keep = begun
-    for level in range(CHAIN_COUNT):
-        t2 = _mate(order, pos, t1)
-        pick, promise, seen = -1, -np.inf, 0
-        for m in range(near.shape[1]):
-            t3 = near[t2, m]
-            left = gained - _gap(points, t2, t3)
-            if left <= GAIN_MM:
-                break
-            if t3 == t1 or (pos[t3] - pos[t2]) % 2:
-                continue
-            t4 = _mate(order, pos, t3)
-            tried = False
-            for k in range(begun + 1, begun + level + 1):
-                if log[k, 0] == t4:
-                    tried = True
-            if tried:
-                continue
-            value = left + _gap(points, t3, t4)
-            if level == 0:
-                if seen == first:
-                    promise, pick = value, t3
-                    break
-                seen += 1
-            elif value > promise:
-                promise, pick = value, t3
-        if pick < 0:
+    for level in range(chain):
+        _exchanges(points, near, order, pos, log, begun, t1, gained, reach, top, ends)
+        pick = first if level == 0 else 0
+        if top[pick] == -np.inf:
             break
-        t4 = _mate(order, pos, pick)
-        _link(points, order, pos, log, t2, pick)
-        gained = promise
-        if gained - _gap(points, t1, t4) > best:
-            best, keep = gained - _gap(points, t1, t4), log[0, 0]
+        gained = top[pick]
+        _exchange(points, order, pos, log, t1, ends[pick, 0], ends[pick, 1])
+        closing = _gap(points, t1, _mate(order, pos, t1))
+        if gained - closing > best:
+            best, keep = gained - closing, log[0, 0]
     _back_to(points, order, pos, log, keep)
     return best if keep > begun else 0.0
 
@@ -282,25 +304,37 @@ def _settle(
     log: Index,
     queue: Index,
     waiting: NDArray[np.bool_],
+    reach: int,
+    chain: int,
+    firsts: int,
 ) -> float:
     """Better the tour about the ends in the queue until none can be bettered; return the gain.
+
+    No exchange turns around more than `reach` ends; `chain` exchanges make one chain at most, begun in `firsts` ways.
 
     `queue[0]` and `queue[1]` are where the ring of waiting ends begins and how many wait.
     """
     size = len(queue) - 2
     total = 0.0
+    top, ends = np.empty(FIRST_COUNT + 1), np.empty((FIRST_COUNT + 1, 2), np.int64)
     while queue[1] > 0:
         v = queue[2 + queue[0]]
         queue[0] = (queue[0] + 1) % size
         queue[1] -= 1
         waiting[v] = False
         begun = log[0, 0]
-        if begun + 2 * CHAIN_COUNT + 8 > len(log):
+        if begun + 3 * CHAIN_COUNT + 8 > len(log):
             log[0, 0] = begun = 0  # only the first, kickless round is this long, and is never taken back
         gain = _shift(points, near, order, pos, log, v)
-        for first in range(FIRST_COUNT):
+        if gain == 0.0:
+            unlinked = _gap(points, v, _mate(order, pos, v))
+            _exchanges(points, near, order, pos, log, begun, v, unlinked, reach, top, ends)
+            if top[FIRST_COUNT] > GAIN_MM:
+                gain = top[FIRST_COUNT]
+                _exchange(points, order, pos, log, v, ends[FIRST_COUNT, 0], ends[FIRST_COUNT, 1])
+        for first in range(firsts):
             if gain == 0.0:
-                gain = _chain(points, near, order, pos, log, v, first)
+                gain = _chain(points, near, order, pos, log, v, first, reach, chain, top, ends)
         if gain > 0.0:
             total += gain
             for k in range(begun + 1, log[0, 0] + 1):
@@ -327,7 +361,7 @@ def _improve(points: Array, near: NDArray[np.int32], order: Index, kicks: int, s
     pos = np.empty(n, np.int64)
     for k in range(n):
         pos[order[k]] = k
-    log = np.zeros((4096, 2), np.int64)
+    log = np.zeros((16384, 2), np.int64)
     queue = np.zeros(n + 2, np.int64)
     waiting = np.zeros(n, np.bool_)
     length = 0.0
@@ -336,7 +370,7 @@ def _improve(points: Array, near: NDArray[np.int32], order: Index, kicks: int, s
     for _ in range(ROUNDS_COUNT):
         for v in order.copy():
             _await(order, pos, queue, waiting, v)
-        gain = _settle(points, near, order, pos, log, queue, waiting)
+        gain = _settle(points, near, order, pos, log, queue, waiting, n, CHAIN_COUNT, FIRST_COUNT)
         length -= gain
         if gain < ROUND_GAIN_RATIO * length:
             break
@@ -356,6 +390,8 @@ def _improve(points: Array, near: NDArray[np.int32], order: Index, kicks: int, s
         grown += _link(points, order, pos, log, c, s)
         for v in (p, s, e, nx, c, d):
             _await(order, pos, queue, waiting, v)
-        grown -= _settle(points, near, order, pos, log, queue, waiting)
+        grown -= _settle(
+            points, near, order, pos, log, queue, waiting, KICK_REACH_COUNT, KICK_CHAIN_COUNT, KICK_FIRST_COUNT
+        )
         if grown > 0.0:
             _back_to(points, order, pos, log, 0)

@@ -30,12 +30,12 @@ class Transport(Protocol):
 
 
 def open_transport(url: str) -> Transport:
-    """Open the line that `url` names; raise `TransportError` saying why it cannot be."""
+    """Open the line that `url` names; raise `TransportError` saying why it cannot be. A bare path is a serial port."""
     try:
         parts = urlsplit(url)
     except ValueError as fault:
         raise TransportError(url, str(fault), "write serial:///dev/… or tcp://host:port") from fault
-    if parts.scheme == "serial":
+    if parts.scheme == "serial" or url.startswith("/"):
         from drivers.transport.serial import SerialTransport
 
         options = dict(parse_qsl(parts.query))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from fabctl.cli.common import bench_option, json_option, lab, say, show
+from fabctl.cli.common import PLACE_MM, bench_option, json_option, lab, say, show
 from fabctl.cli.paths import RUN, InFile, InFolder, OutFile, PhotoFile, config_names
 
 if TYPE_CHECKING:
@@ -23,11 +24,18 @@ BOARD = config_names("boards")
 image_option = click.option("--image", type=InFile(), help="A picture of the bed, instead of the bench's camera.")
 
 
+LARGEST_MM = 20_000.0  # of a bed or a sheet
+
+
 def size(text: str) -> tuple[float, float]:
     """Return both numbers of `200x150`."""
-    w, h = (float(part) for part in text.lower().split("x"))
-    if not (w > 0 and h > 0):
-        raise ValueError(text)
+    parts = text.lower().split("x")
+    try:
+        w, h = (float(part) for part in parts)
+    except ValueError:
+        w = h = math.nan
+    if not (0 < w <= LARGEST_MM and 0 < h <= LARGEST_MM):
+        raise click.BadParameter(f"{text!r} is not two numbers above zero and up to {LARGEST_MM:g}, such as 300x200")
     return w, h
 
 
@@ -43,9 +51,15 @@ def board() -> None:
 
 @board.command("charuco")
 @click.option("--squares", type=size, metavar="WxH", default="10x7", show_default=True, help="Columns and rows.")
-@click.option("--square-mm", type=float, default=20.0, show_default=True)
-@click.option("--marker-mm", type=float, default=15.0, show_default=True)
-@click.option("--name", default="lens", show_default=True)
+@click.option("--square-mm", type=click.FloatRange(1, 1000), default=20.0, show_default=True, help="Side of a square.")
+@click.option(
+    "--marker-mm",
+    type=click.FloatRange(0.5, 1000),
+    default=15.0,
+    show_default=True,
+    help="Side of the marker in a square.",
+)
+@click.option("--name", default="lens", show_default=True, help="The board's name.")
 @json_option
 def charuco(squares: tuple[float, float], square_mm: float, marker_mm: float, name: str, as_json: bool) -> None:
     """Make a ChArUco board for the lens."""
@@ -63,7 +77,7 @@ def charuco(squares: tuple[float, float], square_mm: float, marker_mm: float, na
 @click.option(
     "--size-mm", type=size, metavar="WxH", required=True, help="The bed's travel, or the sheet's width and height."
 )
-@click.option("--side-mm", type=float, default=None, help="Side of a mark's black square.")
+@click.option("--side-mm", type=click.FloatRange(0.5, 1000), default=None, help="Side of a mark's black square.")
 @click.option("--name", default=None, help="The board's name; its kind where none is given.")
 @json_option
 def marks(kind: str, size_mm: tuple[float, float], side_mm: float | None, name: str | None, as_json: bool) -> None:
@@ -73,6 +87,8 @@ def marks(kind: str, size_mm: tuple[float, float], side_mm: float | None, name: 
     from fabctl.vision import boards
 
     side = side_mm or {"bed": 12.0, "registration": 8.0, "scale": 15.0}[kind]
+    if side > min(size_mm) / 4:
+        raise click.UsageError(f"marks of {side:g} mm are too large for {size_mm[0]:g} x {size_mm[1]:g} mm; --side-mm")
     sheet = (
         boards.bed_marks(size_mm, side)
         if kind == "bed"
@@ -85,15 +101,20 @@ def marks(kind: str, size_mm: tuple[float, float], side_mm: float | None, name: 
 
 @board.command("measured")
 @click.argument("name", type=BOARD)
-@click.argument("across_mm", type=float)
-@click.argument("up_mm", type=float)
+@click.argument("across_mm", type=click.FloatRange(1, 20_000))
+@click.argument("up_mm", type=click.FloatRange(1, 20_000))
 @json_option
 def measured(name: str, across_mm: float, up_mm: float, as_json: bool) -> None:
     """Note what the two rulers of the print measure; printers scale."""
     from fabctl.config.boards import load_board, write_board
+    from fabctl.errors import UsageError
 
     config = load_board(name, lab().root)
-    changed = type(config).model_validate({**config.model_dump(), "measured_mm": (across_mm, up_mm)})
+    try:
+        changed = type(config).model_validate({**config.model_dump(), "measured_mm": (across_mm, up_mm)})
+    except ValueError as fault:
+        w, h = config.size_mm
+        raise UsageError(f"{across_mm:g} x {up_mm:g} mm is no print of rulers drawn {w:g} x {h:g} mm long") from fault
     path = lab().root / "configs" / "boards" / f"{config.name}.yaml"
     write_board(changed, path)
     x, y = changed.ratios()
@@ -113,7 +134,7 @@ def _write_board(made: Charuco | MarkSheet, as_json: bool) -> None:
     strokes = [] if isinstance(made, Charuco) else hatch(sheet_ink(made), 0.1, 0.1)
     files = {kind: folder / f"{made.name}.{kind}" for kind in ("yaml", "pdf", "dxf")}
     write_board(config_of(made), files["yaml"])
-    files["pdf"].write_bytes(pdf(drawing))
+    write_atomically(files["pdf"], pdf(drawing))
     write_atomically(files["dxf"], dxf(drawing, strokes))
     w, h = made.size_mm
     lines = [f"{path}" for path in files.values()]
@@ -124,7 +145,7 @@ def _write_board(made: Charuco | MarkSheet, as_json: bool) -> None:
 
 @command.command("show")
 @bench_option
-@click.option("-o", "--output", type=PhotoFile(), default=Path("bed.png"), show_default=True)
+@click.option("-o", "--output", type=PhotoFile(), default=Path("bed.png"), show_default=True, help="The file to write.")
 @json_option
 def show_picture(bench_name: str, output: Path, as_json: bool) -> None:
     """Take one picture of the bed and say whether it can be measured in."""
@@ -142,7 +163,13 @@ def show_picture(bench_name: str, output: Path, as_json: bool) -> None:
 @command.command("calibrate")
 @click.argument("pictures", nargs=-1, type=InFile())
 @click.option("--board", "board_name", type=BOARD, default="lens", show_default=True, help="Board file or its name.")
-@click.option("--views", default=15, show_default=True, help="How many pictures to take from the live camera.")
+@click.option(
+    "--views",
+    type=click.IntRange(1, 1000),
+    default=15,
+    show_default=True,
+    help="How many pictures to take from the live camera.",
+)
 @bench_option
 @json_option
 def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_name: str, as_json: bool) -> None:
@@ -196,11 +223,13 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
 @click.option(
     "--marks", "marks_name", type=BOARD, default="bed", show_default=True, help="Marks at known machine places."
 )
-@click.option("--offset-mm", type=float, nargs=2, default=None, help="Machine place of the marks' own origin.")
+@click.option("--offset-mm", type=PLACE_MM, nargs=2, default=None, help="Machine place of the marks' own origin.")
 @click.option(
     "--engraved", type=RUN, metavar="RUN", help="The run of `fabctl cut marks` that engraved them: it knows the place."
 )
-@click.option("--height-mm", type=float, default=0.0, help="Of the marks over the bed: the sheet's thickness.")
+@click.option(
+    "--height-mm", type=click.FloatRange(0, 1000), default=0.0, help="Of the marks over the bed: the sheet's thickness."
+)
 @image_option
 @bench_option
 @json_option
@@ -276,10 +305,20 @@ def check(image: Path | None, bench_name: str, as_json: bool) -> None:
 
 @command.command("register")
 @click.option("--sheet", "sheet_name", type=BOARD, default="registration", show_default=True, help="The sheet's marks.")
-@click.option("--thickness-mm", type=float, required=True, help="The sheet's: its marks lie that far over the bed.")
+@click.option(
+    "--thickness-mm",
+    type=click.FloatRange(0, 1000),
+    required=True,
+    help="The sheet's: its marks lie that far over the bed.",
+)
 @click.option("--design", type=InFolder(), default=None, help="Design folder whose job is drawn and checked.")
 @click.option(
-    "-o", "--output", type=OutFile((".json",), "a registration"), default=Path("registration.json"), show_default=True
+    "-o",
+    "--output",
+    type=OutFile((".json",), "a registration"),
+    default=Path("registration.json"),
+    show_default=True,
+    help="The file to write.",
 )
 @image_option
 @bench_option

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from types import FrameType
@@ -15,11 +17,13 @@ from typing import Any, TypeVar
 import click
 
 from fabctl.cli.paths import config_names
-from fabctl.cli.refusal import answer_no, exit_code_of, plain, refusal, sentence_of
-from fabctl.errors import BUG, DONE, OPERATOR
+from fabctl.cli.refusal import answer_no, exit_code_of, no_in_words, plain, refusal, sentence_of
+from fabctl.errors import BUG, DONE, OPERATOR, Stopped
 from fabctl.events import Emit, Event
 from fabctl.workspace import Workspace, workspace
 
+TOGETHER_S = 0.5  # signals nearer than that are one
+ERASE_TO_END = "\x1b[K"  # of the terminal's line, from the cursor
 F = TypeVar("F", bound=Callable[..., Any])
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
@@ -32,6 +36,7 @@ bench_option = click.option(
     show_default=True,
     help="Bench file or its name.",
 )
+PLACE_MM = click.FloatRange(-10_000, 10_000)  # of anything on a bench
 MATERIAL = config_names("materials")
 
 
@@ -42,7 +47,20 @@ def lab() -> Workspace:
 
 def say(text: str = "") -> None:
     """Tell the person something; standard error, so that standard output stays for results."""
+    _clear_line()
     click.echo(text, err=True)
+
+
+def _clear_line() -> None:
+    """Take away what a live line of progress has left: its cursor waits at the line's beginning."""
+    if sys.stderr.isatty():
+        click.echo(ERASE_TO_END, err=True, nl=False)
+
+
+def say_keys(text: str) -> None:
+    """Name the keys that act while a job runs, where there is a keyboard."""
+    if sys.stdin.isatty():
+        say(text)
 
 
 def show(data: dict[str, Any], as_json: bool, lines: Iterable[str], code: int = DONE, why: str = "") -> None:
@@ -52,7 +70,10 @@ def show(data: dict[str, Any], as_json: bool, lines: Iterable[str], code: int = 
     """
     if as_json:
         click.echo(_json(data if code == DONE else answer_no(data, code, why)))
+        for line in no_in_words(data, why) if code != DONE else ():
+            say(line)
     else:
+        _clear_line()
         for line in lines:
             click.echo(line)
     if code != DONE:
@@ -75,7 +96,11 @@ def confirm(question: str, yes: bool) -> bool:
     if not sys.stdin.isatty():
         say(f"{question} no (not a terminal; --yes answers yes)")
         return False
-    return click.confirm(question, default=False, err=True)
+    _clear_line()
+    try:
+        return click.confirm(question, default=False, err=True)
+    except click.exceptions.Abort:  # Ctrl-C or Ctrl-D at the question is an answer
+        raise Stopped("stopped at the question; nothing was begun") from None
 
 
 def progress() -> Emit:
@@ -87,19 +112,32 @@ def progress() -> Emit:
         if event.kind == "progress" and event.done_frac is not None:
             text = f"{event.done_frac:6.1%}  {event.message}"
             if live:
-                click.echo(f"\r\x1b[2K{text}", err=True, nl=False)
+                click.echo(f"{ERASE_TO_END}{text}\r", err=True, nl=False)
             elif int(event.done_frac * 10) != tenth[0]:
                 click.echo(text, err=True)
             tenth[0] = int(event.done_frac * 10)
         elif event.kind in ("stage", "state", "warning", "finding"):
-            lead = "\r\x1b[2K" if live else ""
-            click.echo(f"{lead}{event.message}", err=True)
+            say(event.message)
 
     return listen
 
 
-def _terminate(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+def _interrupted_once() -> Callable[[int, FrameType | None], None]:
+    """Return a handler that raises `KeyboardInterrupt`, once for signals that come together.
+
+    A process group's SIGTERM reaches a flow's step twice, from its sender and from the flow, and a hand presses Ctrl-C
+    twice: the second must not break off the record of how the first ended.
+    """
+    heard_s = -math.inf
+
+    def hear(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal heard_s
+        now_s = time.monotonic()
+        together, heard_s = now_s - heard_s < TOGETHER_S, now_s
+        if not together:
+            raise KeyboardInterrupt
+
+    return hear
 
 
 def run_to_the_end(command: click.Command) -> int:
@@ -107,6 +145,9 @@ def run_to_the_end(command: click.Command) -> int:
 
     A second Ctrl-C may come at any moment of the way out: it must not change the exit code.
     """
+    hear = _interrupted_once()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, hear)
     try:
         try:
             return run_guarded(command)
@@ -124,7 +165,6 @@ def _deafen() -> None:
 
 def run_guarded(command: click.Command) -> int:
     """Run `command` and return its exit code (`fabctl.errors` lists them)."""
-    signal.signal(signal.SIGTERM, _terminate)
     try:
         code = command.main(prog_name="fabctl", standalone_mode=False)
         return int(code) if isinstance(code, int) else DONE
@@ -146,6 +186,7 @@ def _report(fault: BaseException) -> int:
     elif isinstance(fault, click.ClickException):
         fault.show()
     elif code == BUG:
+        _clear_line()
         traceback.print_exception(fault, file=sys.stderr)
         say("fabctl: this is a bug in fabctl; please report it with the lines above")
     else:

@@ -7,7 +7,18 @@ from typing import Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.common import (
+    MATERIAL,
+    PLACE_MM,
+    bench_option,
+    confirm,
+    json_option,
+    lab,
+    progress,
+    say_keys,
+    show,
+    yes_option,
+)
 from fabctl.cli.cut_camera import marks_command
 from fabctl.cli.cut_inspect import inspect_command
 from fabctl.cli.paths import RUN, InFile, InFolder, config_names
@@ -25,7 +36,7 @@ command.add_command(marks_command)
 @command.command("run")
 @click.argument("design", type=InFolder())
 @click.option("--material", type=MATERIAL, help="Material file or its name  [the design's own].")
-@click.option("--sheet", type=click.IntRange(1), help="Sheet to cut, of a design that is split over several.")
+@click.option("--sheet", type=click.IntRange(1, 999), help="Sheet to cut, of a design that is split over several.")
 @click.option(
     "--origin",
     type=click.Choice(["home", "here", "camera"]),
@@ -40,7 +51,9 @@ command.add_command(marks_command)
     show_default=True,
     help="With --origin camera: the sheet's marks.",
 )
-@click.option("--at-mm", type=float, nargs=2, default=(0.0, 0.0), help="Where on that sheet the design's corner lies.")
+@click.option(
+    "--at-mm", type=PLACE_MM, nargs=2, default=(0.0, 0.0), help="Where on that sheet the design's corner lies."
+)
 @click.option("--image", type=InFile(), help="A picture of the bed as it is now.")
 @click.option("--camera-file", type=InFile(), help="Sheet to machine map, JSON.")
 @click.option("--frame", is_flag=True, help="Go once around the job first, and ask whether it fits.")
@@ -69,7 +82,10 @@ def run(
     yes: bool,
     as_json: bool,
 ) -> None:
-    """Cut the design in folder DESIGN: plan, check, one question, then cut; a run record either way."""
+    """Cut the design in folder DESIGN: plan, check, one question, then cut.
+
+    A run record is kept whatever comes of it, also of a refusal or a no; of a dry run none.
+    """
     from dataclasses import replace
 
     from fabctl.bench import open_bench
@@ -103,7 +119,7 @@ def run(
             order = replace(order, eye=eye_of(bench, marks, at_mm, chosen.thickness_mm, camera_file, image))
         desk = Desk(lambda question: confirm(question, yes), progress(), keys)
         if not dry_run:
-            say(HELP)
+            say_keys(HELP)
         if resume_run is not None:
             from fabctl.cut.resume import resume
 

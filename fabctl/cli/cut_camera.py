@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
 from fabctl.cli.paths import config_names
 
 if TYPE_CHECKING:
@@ -64,7 +64,13 @@ def _is_registration(path: Path) -> bool:
 @click.option(
     "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives power and speed."
 )
-@click.option("--origin", type=click.Choice(["home", "here"]), default="home", show_default=True)
+@click.option(
+    "--origin",
+    type=click.Choice(["home", "here"]),
+    default="home",
+    show_default=True,
+    help="Where the board's corner lies: in the corner of the travel, or where the head is.",
+)
 @click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
 @bench_option
 @yes_option
@@ -111,5 +117,5 @@ def plain_job(order: CutOrder, bench_name: str, purpose: str, yes: bool, dry_run
     home = lab()
     with open_bench(home, load_bench(bench_name, home.root), purpose) as bench, keyboard() as keys:
         if not dry_run:
-            say(HELP)
+            say_keys(HELP)
         return cut(home, bench, order, Desk(lambda question: confirm(question, yes), progress(), keys), dry_run)

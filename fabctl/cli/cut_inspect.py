@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 @click.command("inspect")
 @click.argument("specimen", type=SPECIMEN)
-@click.option("--thickness-mm", type=float, default=None, help="The sheet's; its material's when not given.")
+@click.option(
+    "--thickness-mm", type=click.FloatRange(0, 100), default=None, help="The sheet's; its material's when not given."
+)
 @click.option("--registration", type=InFile(), help="Where the sheet lies now, if it was moved since the cut.")
 @click.option(
     "-o", "--output", type=PhotoFile(), default=Path("inspection.png"), show_default=True, help="Annotated picture."

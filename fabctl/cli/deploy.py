@@ -30,9 +30,13 @@ if TYPE_CHECKING:
     show_default=True,
     help="What the rim stands on, with --gravity.",
 )
-@click.option("--friction", type=click.FloatRange(0), default=0.5, show_default=True, help="Coefficient for coulomb.")
+@click.option(
+    "--friction", type=click.FloatRange(0, 10), default=0.5, show_default=True, help="Coefficient for coulomb."
+)
 @click.option("--level-floor", is_flag=True, help="A level floor instead of a bed made to the rim.")
-@click.option("--shapes", type=click.IntRange(0), default=0, help="Look for other equilibria from this many starts.")
+@click.option(
+    "--shapes", type=click.IntRange(0, 10_000), default=0, help="Look for other equilibria from this many starts."
+)
 @click.option(
     "--hint",
     "hints",
@@ -192,7 +196,7 @@ def _cascade(laid: Laid, folder: Path, popped: Deployed, animation: bool, emit: 
     write_atomically(folder / "cascade.csv", cascade_csv(found))
     if animation:
         gif = animation_gif(followed(found.frames_mm, popped.mesh.vertices_mm), popped.mesh, "opened unit by unit")
-        (folder / "cascade.gif").write_bytes(gif)
+        write_atomically(folder / "cascade.gif", gif)
     end = replace(popped.equilibrium, x_mm=found.x_mm)
     off = compared(laid.layout, end, laid.target, laid.design_mm).deviation
     return {
@@ -241,10 +245,10 @@ def _write(
     shown = popped.mesh if settled is None else TriMesh(settled.equilibrium.x_mm, popped.mesh.faces)
     write_ply(folder / "deployed.ply", shown)
     title = "deployed" if settled is None else f"deployed, under its weight ({facts['support']})"
-    (folder / "deployed.png").write_bytes(picture_png(shown, laid.target, title))
+    write_atomically(folder / "deployed.png", picture_png(shown, laid.target, title))
     if animation:
         frames = deployment(laid.layout, popped.mesh.vertices_mm)
-        (folder / "deployment.gif").write_bytes(animation_gif(frames, popped.mesh, "deployment"))
+        write_atomically(folder / "deployment.gif", animation_gif(frames, popped.mesh, "deployment"))
     write_atomically(folder / "deploy.json", as_json(facts))
 
 

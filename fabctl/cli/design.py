@@ -25,7 +25,7 @@ command.add_command(coupon_read)
 @command.command()
 @click.argument("spec", type=config_names("specs"))
 @click.option("--target", type=InFile(), help="Mesh to use instead of the specification's.")
-@click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell, instead of the specification's.")
+@click.option("--cell-mm", type=click.FloatRange(0.1, 1000), help="Edge of a cell, instead of the specification's.")
 @library_option
 @click.option("-o", "--output", type=OutFolder(), help="Design folder to write [out/NAME].")
 @click.option("--replace", is_flag=True, help="Replace a design that lies in that folder.")
@@ -73,7 +73,7 @@ def build(
 @click.option(
     "--material", type=MATERIAL, help="Material file or its name, for a mesh or surface [natural-rubber-2.3]."
 )
-@click.option("--cell-mm", type=click.FloatRange(0.1), help="Edge of a cell [the material's].")
+@click.option("--cell-mm", type=click.FloatRange(0.1, 1000), help="Edge of a cell [the material's].")
 @library_option
 @click.option("--cells", type=click.Choice(["expanding", "contracting"]),
               help="Kind of cells, for a mesh or surface [expanding].")  # fmt: skip
@@ -100,6 +100,7 @@ def check(
     from design.checking import misfit_png
     from fabctl.designing import inputs_for
     from fabctl.errors import DONE, REFUSED
+    from fabctl.records.folder import write_atomically
 
     listen = progress()
     inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
@@ -109,7 +110,7 @@ def check(
 
     found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, remedy, watch)
     if picture is not None:
-        picture.write_bytes(misfit_png(inputs.mesh, found.report, inputs.spec.name))
+        write_atomically(picture, misfit_png(inputs.mesh, found.report, inputs.spec.name))
     findings = [*inputs.findings, *found.findings]
     for finding in findings:
         say(str(finding))

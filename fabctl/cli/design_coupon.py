@@ -19,17 +19,24 @@ library_option = click.option("--library", type=InFile(), help="Library of cells
 
 
 @click.command()
-@click.option("--expansion", "expansion_ratio", type=click.FloatRange(1, min_open=True), default=1.5,
+@click.option("--expansion", "expansion_ratio", type=click.FloatRange(1, 3, min_open=True), default=1.5,
               show_default=True, help="Of the cell to try.")  # fmt: skip
 @click.option("--hinges-mm", default="0.20,0.25,0.30,0.35,0.40,0.45", show_default=True, help="Ladder of hinge widths.")
 @click.option(
     "--material", type=MATERIAL, default="natural-rubber-2.3", show_default=True, help="Material file or its name."
 )
 @library_option
-@click.option("-o", "--output", type=OutFolder(), required=True, help="New folder for the coupon.")
+@click.option("-o", "--output", type=OutFolder(), required=True, help="Folder for the coupon.")
+@click.option("--replace", is_flag=True, help="Replace a design or coupon that lies in that folder.")
 @json_option
 def coupon(
-    expansion_ratio: float, hinges_mm: str, material: str, library: Path | None, output: Path, as_json: bool
+    expansion_ratio: float,
+    hinges_mm: str,
+    material: str,
+    library: Path | None,
+    output: Path,
+    replace: bool,
+    as_json: bool,
 ) -> None:
     """Make a sheet of uniform patches, one a hinge width, to check the library on the real material.
 
@@ -40,11 +47,11 @@ def coupon(
     from fabctl.designing import write_coupon
 
     hinges = tuple(numbers(hinges_mm, "--hinges-mm"))
-    if min(hinges) <= 0:
-        raise click.UsageError("--hinges-mm takes widths above zero")
+    if not all(0.01 <= hinge <= 10 for hinge in hinges):
+        raise click.UsageError("--hinges-mm takes widths from 0.01 to 10 mm")
     chosen_from = None if library is None else str(library.resolve())
     asked = CouponConfig(material=material, expansion_ratio=expansion_ratio, hinges_mm=hinges, library=chosen_from)
-    made, bundle = write_coupon(output, asked, lab().root)
+    made, bundle = write_coupon(output, asked, lab().root, replace)
     width, height = made.drawing.size_mm
     lines = [f"{output}: {len(made.patches)} patches on {width:.0f} × {height:.0f} mm"]
     for patch in made.patches:
@@ -56,7 +63,7 @@ def coupon(
 
 @click.command("coupon-read")
 @click.argument("form", type=SPECIMEN_OR_FILE)
-@click.option("--length-error-mm", type=click.FloatRange(min=0), default=0.2, show_default=True,
+@click.option("--length-error-mm", type=click.FloatRange(0, 100), default=0.2, show_default=True,
               help="Standard error of one reading of a length.")  # fmt: skip
 @click.option(
     "--specimen", type=SPECIMEN, help="Specimen that the form belongs to, where it is not the specimen's own."

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import click
 
-from fabctl.bench import deployment_checklist, refuse_without
+from fabctl.bench import deployment_checklist, open_bench, refuse_without
 from fabctl.cli.common import bench_option, json_option, lab, progress, say, show, yes_option
 from fabctl.cli.paths import SPECIMEN, InFile, config_names
 from fabctl.config.bench import find, load_bench
+from fabctl.config.method import load_method
 from fabctl.errors import DONE, OUT_OF_TOLERANCE
 from fabctl.flow import Flow, Order, continued, runner, steps_after_deployment, steps_until_cut
 
@@ -27,8 +28,20 @@ from fabctl.flow import Flow, Order, continued, runner, steps_after_deployment, 
     show_default=True,
     help="How it is pressed: file, or name in configs/methods.",
 )
-@click.option("--tolerance-frac", type=float, default=0.02, show_default=True, help="Of the target's diagonal.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Same seed, same scan and same answer.")
+@click.option(
+    "--tolerance-frac",
+    type=click.FloatRange(0, 10, min_open=True),
+    default=0.02,
+    show_default=True,
+    help="Of the target's diagonal.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    default=0,
+    show_default=True,
+    help="Same seed, same scan and same answer.",
+)
 @bench_option
 @yes_option
 @json_option
@@ -57,17 +70,20 @@ def command(
         from design.meshfiles import read_mesh
 
         read_mesh(target)  # a mesh that cannot be used is told now, not by the first step
+    load_method(method, home.root)  # a mistake in it is told now, not after the cut
     order = Order(bench, bench_name, method, tolerance_frac, yes, seed)
-    run, emit = runner(home), progress()
-    if specimen is not None:
-        flow = continued(home, specimen)
-    else:
-        assert spec is not None
-        flow = steps_until_cut(home, order, find("specs", spec, home.root), target, run, emit)
-        if bench.deployment == "by_hand":
-            _wait_for_a_person(flow, order, as_json)
-            return
-    flow = steps_after_deployment(order, flow, run, emit)
+    with open_bench(home, bench, f"flow {specimen or spec}") as held:
+        run, emit = runner(home, held), progress()
+        if specimen is not None:
+            flow = continued(home, specimen)
+        else:
+            assert spec is not None
+            flow = steps_until_cut(home, order, find("specs", spec, home.root), target, run, emit)
+        by_hand = specimen is None and bench.deployment == "by_hand"
+        flow = flow if by_hand else steps_after_deployment(order, flow, run, emit)
+    if by_hand:
+        _wait_for_a_person(flow, order, as_json)
+        return
     report = flow.steps["report"]
     data = {"specimen": flow.specimen, "design": flow.design, **flow.steps}
     data |= {"verdict": report["verdict"], "sentence": report["sentence"], "report": report["report"]}

@@ -24,6 +24,7 @@ NAMED = (
     ("barrier", "barrier_mJ", "mJ"),
     ("recovery", "recovery_ratio", ""),
 )
+HELD = (("relaxation", "relaxation_ratio", ""), ("creep", "creep_mm", "mm"))  # told only where a method holds
 WORDS = {name: words for words, name, _ in NAMED}
 
 
@@ -45,8 +46,15 @@ def command() -> None:
 @click.option(
     "--resume", type=RUN, metavar="RUN", help="Go on with an interrupted run, at its next whole curve or point."
 )
-@click.option("--temperature-degC", type=float, help="Room temperature, where the rig has no sensor of its own.")
-@click.option("--humidity-frac", type=float, help="Relative humidity, 0 to 1.")
+@click.option(
+    "--temperature-degC",
+    type=click.FloatRange(-50, 150),
+    help="Room temperature, where the rig has no sensor of its own.",
+)
+@click.option("--humidity-frac", type=click.FloatRange(0, 1), help="Relative humidity, 0 to 1.")
+@click.option("--thickness-mm", type=click.FloatRange(0, 100, min_open=True), help="As measured on this specimen.")
+@click.option("--batch", help="Of the material.")
+@click.option("--rest-h", type=click.FloatRange(0, 100_000), help="Hours since it was deployed, or last pressed.")
 @click.option("--dry-run", is_flag=True, help="Stop after the check; nothing moves.")
 @yes_option
 @json_option
@@ -57,6 +65,9 @@ def run_command(
     resume: str | None,
     temperature_degc: float | None,
     humidity_frac: float | None,
+    thickness_mm: float | None,
+    batch: str | None,
+    rest_h: float | None,
     dry_run: bool,
     yes: bool,
     as_json: bool,
@@ -71,7 +82,14 @@ def run_command(
     place = lab()
     bench_config = load_bench(bench_name, place.root)
     earlier = place.run(resume) if resume else None
-    plan = plan_test(place, place.specimen(specimen), method, bench_config, earlier)
+    facts = {
+        "temperature_degC": temperature_degc,
+        "humidity_frac": humidity_frac,
+        "thickness_mm": thickness_mm,
+        "batch": batch,
+        "rest_h": rest_h,
+    }
+    plan = plan_test(place, place.specimen(specimen), method, bench_config, earlier, facts)
     for line in _screen(plan, bench_config.name):
         say(line)
     refuse(plan)
@@ -80,16 +98,8 @@ def run_command(
         return
     if not confirm("Start?", yes):
         raise Stopped("not started")
-    facts = {"temperature_degC": temperature_degc, "humidity_frac": humidity_frac}
     with open_bench(place, bench_config, f"testing {specimen}") as bench, Keys(progress()) as keys:
-        run = run_test(
-            place,
-            plan,
-            bench,
-            keys.listen,
-            Steering(keys.wish, keys.go_on),
-            {name: value for name, value in facts.items() if value is not None},
-        )
+        run = run_test(place, plan, bench, keys.listen, Steering(keys.wish, keys.go_on))
     _render(run, as_json)
 
 
@@ -136,8 +146,9 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
     type=click.Choice(["csv", "parquet", "hdf5", "bluesky"]),
     default="csv",
     show_default=True,
+    help="Of the file.",
 )
-@click.option("-o", "--output", type=OutFile(), required=True)
+@click.option("-o", "--output", type=OutFile(), required=True, help="The file to write.")
 @json_option
 def export_command(run: str, kind: str, output: Path, as_json: bool) -> None:
     """Write the samples of RUN for other programs: CSV with units, Parquet, HDF5, or bluesky documents."""
@@ -193,7 +204,7 @@ def _short(entry: dict[str, Any]) -> str:
 
 
 def _lines(result: dict[str, Any]) -> Iterator[str]:
-    for words, name, unit in NAMED:
+    for words, name, unit in (*NAMED, *(row for row in HELD if result.get(row[1]) is not None)):
         value = result.get(name)
         if value is None:
             yield f"  {words:22} not found: {result.get('not_found', {}).get(name, 'no curve')}"

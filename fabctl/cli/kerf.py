@@ -72,7 +72,13 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
 
 @command.command("cut")
 @click.argument("folder", type=InFolder())
-@click.option("--origin", type=click.Choice(["home", "here"]), default="home", show_default=True)
+@click.option(
+    "--origin",
+    type=click.Choice(["home", "here"]),
+    default="home",
+    show_default=True,
+    help="Where the coupon's corner lies: in the corner of the travel, or where the head is.",
+)
 @click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
 @bench_option
 @yes_option
@@ -128,7 +134,13 @@ def read_coupon(path: Path) -> tuple[Coupon, str]:
     "--coupon", "coupon_file", type=InFile(), required=True, help="The coupon.json of the coupon in the picture."
 )
 @click.option("--write", is_flag=True, help="Write the kerf into the lab's material file.")
-@click.option("--gamma", type=click.Choice(["srgb", "linear"]), default="srgb", show_default=True)
+@click.option(
+    "--gamma",
+    type=click.Choice(["srgb", "linear"]),
+    default="srgb",
+    show_default=True,
+    help="How the picture's grey follows light.",
+)
 @json_option
 def measure(image: Path, coupon_file: Path, write: bool, gamma: str, as_json: bool) -> None:
     """Measure the kerf per power and direction in a picture of the coupon, with its uncertainty."""

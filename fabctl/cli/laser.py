@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import bench_option, confirm, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.common import PLACE_MM, bench_option, confirm, json_option, lab, progress, say, show, yes_option
 from fabctl.cli.finite import numbers
 from fabctl.cli.paths import OutFile
 
@@ -112,9 +112,9 @@ def unlock(bench_name: str, yes: bool, as_json: bool) -> None:
 
 
 @command.command("jog", context_settings={"ignore_unknown_options": True})
-@click.argument("x_mm", type=float)
-@click.argument("y_mm", type=float)
-@click.option("--feed", "feed_mm_s", type=click.FloatRange(min=0.1), default=50.0, show_default=True, help="mm/s")
+@click.argument("x_mm", type=PLACE_MM)
+@click.argument("y_mm", type=PLACE_MM)
+@click.option("--feed", "feed_mm_s", type=click.FloatRange(0.1, 10_000), default=50.0, show_default=True, help="mm/s")
 @bench_option
 @yes_option
 @json_option
@@ -179,8 +179,8 @@ def console(bench_name: str) -> None:
 
 
 @command.command("frame")
-@click.argument("width_mm", type=click.FloatRange(min=1))
-@click.argument("height_mm", type=click.FloatRange(min=1))
+@click.argument("width_mm", type=click.FloatRange(1, 10_000))
+@click.argument("height_mm", type=click.FloatRange(1, 10_000))
 @click.option("--power", "power_frac", type=click.FloatRange(0, 0.05), default=0.0, help="Fraction of full power.")
 @bench_option
 @yes_option
@@ -209,7 +209,9 @@ def _go_around(laser: Laser, bench: Bench, corners: tuple[str, ...], power_frac:
 @click.option("--powers", default="0.2,0.4,0.6,0.8,1.0", show_default=True, help="Fractions of full power.")
 @click.option("--feeds", default="10,15,20,25,30", show_default=True, help="Speeds, mm/s.")
 @click.option("--passes", default="1", show_default=True, help="Numbers of passes.")
-@click.option("--cell-mm", type=click.FloatRange(min=2), default=8.0, show_default=True)
+@click.option(
+    "--cell-mm", type=click.FloatRange(2, 200), default=8.0, show_default=True, help="Side of one square of the grid."
+)
 @click.option("-o", "--out", type=OutFile(), help="Only write the program to this file.")
 @bench_option
 @yes_option
@@ -226,12 +228,18 @@ def testgrid(
         tuple(int(value) for value in numbers(passes, "--passes")),
         cell_mm,
     )
-    if not all(0 < power <= 1 for power in grid.powers_frac) or min(grid.feeds_mm_s) <= 0 or min(grid.passes) < 1:
-        raise click.UsageError("powers are fractions up to 1, feeds and passes positive")
+    if (
+        not all(0 < power <= 1 for power in grid.powers_frac)
+        or min(grid.feeds_mm_s) <= 0
+        or not all(1 <= count <= 100 for count in grid.passes)
+    ):
+        raise click.UsageError("powers are fractions up to 1, feeds above zero, passes 1 to 100")
     width, height = size_mm(grid)
     facts = {"width_mm": width, "height_mm": height, "cells_count": len(grid.powers_frac) * len(grid.feeds_mm_s)}
     if out:
-        out.write_text("\n".join(grid_lines(grid, 1000.0)) + "\n", encoding="ascii")
+        from fabctl.records.folder import write_atomically
+
+        write_atomically(out, "\n".join(grid_lines(grid, 1000.0)) + "\n")
         show({**facts, "file": str(out)}, as_json, [f"{out}: {width:g} × {height:g} mm, for $30=1000"])
         return
     from fabctl.cut.by_hand import run_here

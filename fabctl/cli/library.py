@@ -1,9 +1,8 @@
-"""`fabctl library`: build, look into, compare and calibrate the library of bistable cells."""
+"""`fabctl library`: look into, compare and calibrate the library of bistable cells; `library_build` makes one."""
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -11,33 +10,28 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from fabctl.cli.common import MATERIAL, json_option, lab, progress, say, show
-from fabctl.cli.paths import InFile, OutFile, PictureFile
+from fabctl.cli.common import json_option, progress, show
+from fabctl.cli.library_build import build
+from fabctl.cli.library_parts import (
+    file_option,
+    jobs_option,
+    lines_of,
+    material_option,
+    processes_of,
+    sheet_named,
+    summary,
+    t_option,
+    theta_option,
+)
+from fabctl.cli.paths import InFile, PictureFile
 
 if TYPE_CHECKING:
     from design.cells.calibrate import Loading
     from design.cells.compare import Comparison, Unanswered
     from design.cells.homogenise import Cell, Failure
-    from design.cells.library import CellLibrary
     from design.cells.sheet import Sheet
-    from design.cells.sweep import Progress
 
-material_option = click.option(
-    "--material", type=MATERIAL, default="natural-rubber-2.3", show_default=True, help="Material file or its name."
-)
-file_option = click.option(
-    "--library", "file", type=InFile(), help="A library file [the shipped one of the paper's sheet]."
-)
-t_option = click.option("--t-mm", type=float, required=True, help="Where slit 1 starts on its edge.")
-theta_option = click.option("--theta-deg", type=float, required=True, help="Direction of slit 1.")
 TOLD_ROWS_COUNT = 10  # of the rows without numbers, for a person
-jobs_option = click.option("--jobs", type=int, default=-1, show_default=True, help="Processes; -1 is one per core.")
-
-
-def _sheet(material: str) -> Sheet:
-    from fabctl.config.material import load_material, sheet_of
-
-    return sheet_of(load_material(material, lab().root))
 
 
 @click.group()
@@ -45,105 +39,7 @@ def command() -> None:
     """Build, look into and compare the library of bistable cells."""
 
 
-@command.command()
-@material_option
-@click.option(
-    "--theta", "theta_count", type=click.IntRange(5), default=43, show_default=True, help="Angles, -30° to 30°."
-)
-@click.option("--t-step-mm", type=float, default=0.01, show_default=True, help="Step of t.")
-@click.option(
-    "--open", "is_open", is_flag=True, help="The contracting kind: cut as holes, closing to its second state."
-)
-@jobs_option
-@click.option("--cluster", metavar="URL", help="A dask scheduler, tcp://HOST:PORT, whose workers have fabctl.")
-@click.option("-o", "--output", type=OutFile((".npz",), "a library"), default=Path("library.npz"), show_default=True)
-@json_option
-def build(
-    material: str,
-    theta_count: int,
-    t_step_mm: float,
-    is_open: bool,
-    jobs: int,
-    cluster: str | None,
-    output: Path,
-    as_json: bool,
-) -> None:
-    """Simulate every cell of a sheet; goes on where an earlier build stopped."""
-    processes = _processes(jobs)
-    from design.cells.sweep import plan_of, sweep
-
-    sheet = _sheet(material)
-    plan = plan_of(sheet, theta_count, t_step_mm, kind="open" if is_open else "slit")
-    parts = lab().root / "library-cache"
-    report = _progress()
-    try:
-        cells = sweep(plan, parts, jobs=processes, cluster=cluster, report=report)
-    except KeyboardInterrupt:
-        say(f"stopped; finished columns are kept in {parts / plan.key()[:16]}, the same command goes on from there")
-        raise
-    from design.cells.library import load_library, save_library
-
-    words = f"fabctl library build --material {material} --theta {theta_count} --t-step-mm {t_step_mm:g}"
-    save_library(output, plan, sheet, cells, words + (" --open" if is_open else ""))
-    library = load_library(output)
-    show({"file": str(output), **_summary(library)}, as_json, [f"{output}", *_lines(library)])
-
-
-def _processes(jobs: int) -> int:
-    """Return how many processes work, each with one thread.
-
-    The matrices of a cell are too small to share: on a busy machine two threads of BLAS cost a column 5.5 s of
-    processor time, one costs 3.2 s. Called before NumPy is loaded, which reads these once; workers inherit them.
-    """
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-    return len(os.sched_getaffinity(0)) if jobs == -1 else max(jobs, 1)
-
-
-def _progress() -> Any:
-    from fabctl.events import Event
-
-    listen = progress()
-
-    def report(now: Progress) -> None:
-        left = "" if now.left_s is None else f", {now.left_s:.0f} s left"
-        text = f"{now.done_count} of {now.total_count} cells, {now.elapsed_s:.0f} s{left}"
-        listen(Event("progress", text, now.done_count / now.total_count))
-
-    return report
-
-
-def _summary(library: CellLibrary) -> dict[str, Any]:
-    low, high = library.range_ratio()
-    return {
-        "cells_count": len(library), "range_ratio": [low, high], "spread_ratio": high / low,
-        "candidates": library.counts(),
-        "reasons": library.reasons(),
-        "shallow_count": len(library.shallow_cells()[0]),
-        "sheet": asdict(library.sheet),
-        "hash": library.hash,
-        "command": library.meta["command"],
-    }  # fmt: skip
-
-
-def _lines(library: CellLibrary) -> Iterator[str]:
-    from design.cells.homogenise import SHALLOW_WELL_RATIO
-
-    low, high = library.range_ratio()
-    sheet = library.sheet
-    yield f"{len(library)} bistable cells, expansion {low:.4f} to {high:.4f} (spread {high / low:.3f})"
-    if shallow := len(library.shallow_cells()[0]):
-        yield (
-            f"{shallow} of them were decided at half the mesh size: at the full size their barrier is less than "
-            f"{SHALLOW_WELL_RATIO:.1%} of the energy stored"
-        )
-    yield "candidates: " + ", ".join(f"{count} {verdict}" for verdict, count in library.counts().items())
-    yield from (f"  {count:5d} {reason}" for reason, count in library.reasons().items())
-    yield (
-        f"sheet: edge {sheet.edge_mm:g} mm, slit {sheet.slit_mm:g} mm, hinge {sheet.hinge_mm:g} mm, thickness "
-        f"{sheet.thickness_mm:g} mm, E {sheet.E_MPa:g} MPa, ν {sheet.nu_ratio:g}"
-    )
-    yield f"hash {library.hash[:16]}, made by: {library.meta['command']}"
+command.add_command(build)
 
 
 @command.command("show")
@@ -154,14 +50,18 @@ def show_command(file: Path | None, as_json: bool) -> None:
     from design.cells.library import load_library
 
     library = load_library(file)
-    show(_summary(library), as_json, _lines(library))
+    show(summary(library), as_json, lines_of(library))
 
 
 @command.command()
 @file_option
-@click.option("--t-mm", type=float, help="Plot energy and force of this cell instead of the maps.")
-@click.option("--theta-deg", type=float)
-@click.option("-o", "--output", type=PictureFile(), default=Path("library.svg"), show_default=True)
+@click.option(
+    "--t-mm", type=click.FloatRange(-1000, 1000), help="Plot energy and force of this cell instead of the maps."
+)
+@click.option("--theta-deg", type=click.FloatRange(-360, 360), help="Direction of slit 1 of that cell.")
+@click.option(
+    "-o", "--output", type=PictureFile(), default=Path("library.svg"), show_default=True, help="The picture to write."
+)
 @json_option
 def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output: Path, as_json: bool) -> None:
     """Draw the four maps, or energy and force of one cell along its uniaxial stretch."""
@@ -212,7 +112,7 @@ def cell_command(t_mm: float, theta_deg: float, material: str, output: Path | No
     from fabctl.errors import REFUSED
     from fabctl.reports import cells as pictures
 
-    sheet, theta = _sheet(material), math.radians(theta_deg)
+    sheet, theta = sheet_named(material), math.radians(theta_deg)
     cell = solve_cell(t_mm, theta, sheet)
     numbers = _numbers(cell, sheet)
     numbers["slits_mm"] = None if cell.verdict == "invalid" else cell_slits(t_mm, theta, sheet).tolist()
@@ -272,7 +172,7 @@ def _numbers(cell: Cell, sheet: Sheet) -> dict[str, Any]:
 @json_option
 def compare(published: Path, material: str, file: Path | None, jobs: int, as_json: bool) -> None:
     """Compare with a PUBLISHED table: each row solved afresh, then the library interpolated."""
-    processes = _processes(jobs)
+    processes = processes_of(jobs)
     import numpy as np
 
     from design.cells import compare as comparing
@@ -281,7 +181,7 @@ def compare(published: Path, material: str, file: Path | None, jobs: int, as_jso
     from fabctl.events import Event
     from fabctl.files import text_of
 
-    sheet, library = _sheet(material), load_library(file)
+    sheet, library = sheet_named(material), load_library(file)
     try:
         table = comparing.read_published(text_of(published, "a table of cells"), sheet)
     except comparing.TableError as fault:
@@ -358,8 +258,8 @@ def _finite(value: Any) -> Any:
 @command.command()
 @click.argument("measured", type=InFile())
 @click.argument("response", type=InFile())
-@click.option("--point", type=int, help="Which of MEASURED's points, where it has several.")
-@click.option("--curve", type=int, help="Which curve of that point [the last].")
+@click.option("--point", type=click.IntRange(0, 9999), help="Which of MEASURED's points, where it has several.")
+@click.option("--curve", type=click.IntRange(0, 9999), help="Which curve of that point [the last].")
 @material_option
 @json_option
 def calibrate(
@@ -368,7 +268,7 @@ def calibrate(
     """Find E·thickness: MEASURED (a run's curves.csv) against the RESPONSE.csv predicted for the same specimen."""
     from design.cells.calibrate import calibrate as fit
 
-    sheet = _sheet(material)
+    sheet = sheet_named(material)
     loading, model = _loading(measured, point, curve), _loading(response)
     found = fit(loading.depth_mm, loading.force_N, model.depth_mm, model.force_N)
     stretch = sheet.E_MPa * sheet.thickness_mm

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 import sys
 
 import click
@@ -66,6 +67,8 @@ def main() -> None:
     """Run the command line; every error ends here, as a message and an exit code."""
     from fabctl.cli.common import run_to_the_end
 
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a θ on a terminal that has none ends no command
     sys.exit(run_to_the_end(cli))
 
 

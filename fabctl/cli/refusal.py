@@ -82,6 +82,15 @@ def answer_no(data: Mapping[str, Any], code: int, why: str) -> dict[str, Any]:
     return {"error": why, "exit_code": code, **data, "findings": findings}
 
 
+def no_in_words(data: Mapping[str, Any], why: str) -> Iterator[str]:
+    """Yield for a person what a result that is a no says, where the result itself goes to a program."""
+    yield f"fabctl: {why}"
+    for row in data.get("findings") or ():
+        if row["level"] == "error":
+            found = Finding(row["code"], row["message"], row["level"], row["where"], row["hint"])
+            yield f"  {found}"
+
+
 def _findings(fault: BaseException) -> Iterator[dict[str, Any]]:
     carried: tuple[Finding, ...] = getattr(fault, "findings", ())
     if isinstance(fault, ConfigError):
@@ -113,6 +122,8 @@ def code_of(fault: BaseException) -> str:
         return "USAGE"
     if isinstance(fault, click.exceptions.Abort | KeyboardInterrupt):
         return "STOPPED"
+    if isinstance(fault.__cause__, OSError) and fault.__cause__.errno in STORAGE:
+        return "STORAGE"
     if isinstance(fault, OSError) and not isinstance(fault, DeviceError):
         return "STORAGE" if fault.errno in STORAGE else "FILE"
     if exit_code_of(fault) == BUG:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import bench_option, confirm, json_option, lab, show, yes_option
+from fabctl.cli.common import PLACE_MM, bench_option, confirm, json_option, lab, show, yes_option
 
 if TYPE_CHECKING:
     from drivers.rig.indenter import Indenter
     from drivers.rig.samples import Sample
     from fabctl.bench import Bench
 
+SPEED_MM_S = click.FloatRange(0, 1000, min_open=True)
 JOG_FORCE_N = 1.0  # an operator's hand-driven motion stops at the first touch
 
 
@@ -44,7 +45,9 @@ def info(bench_name: str, as_json: bool) -> None:
 
 @command.command()
 @bench_option
-@click.option("--time-s", default=1.0, show_default=True, help="How long to average.")
+@click.option(
+    "--time-s", type=click.FloatRange(0.05, 3600), default=1.0, show_default=True, help="How long to average."
+)
 @json_option
 def tare(bench_name: str, time_s: float, as_json: bool) -> None:
     """Average the force with the indenter free: the zero, its noise and drift. Nothing moves."""
@@ -61,7 +64,7 @@ def tare(bench_name: str, time_s: float, as_json: bool) -> None:
 
 @command.command()
 @bench_option
-@click.option("--speed-mm-s", default=5.0, show_default=True)
+@click.option("--speed-mm-s", type=SPEED_MM_S, default=5.0, show_default=True, help="How fast the stage moves.")
 @yes_option
 @json_option
 def home(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
@@ -70,9 +73,9 @@ def home(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
 
 
 @command.command()
-@click.argument("by_mm", type=float)
+@click.argument("by_mm", type=PLACE_MM)
 @bench_option
-@click.option("--speed-mm-s", default=1.0, show_default=True)
+@click.option("--speed-mm-s", type=SPEED_MM_S, default=1.0, show_default=True, help="How fast the stage moves.")
 @yes_option
 @json_option
 def jog(by_mm: float, bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
@@ -89,7 +92,7 @@ def jog(by_mm: float, bench_name: str, speed_mm_s: float, yes: bool, as_json: bo
 
 @command.command()
 @bench_option
-@click.option("--speed-mm-s", default=1.0, show_default=True)
+@click.option("--speed-mm-s", type=SPEED_MM_S, default=1.0, show_default=True, help="How fast the stage moves.")
 @yes_option
 @json_option
 def retract(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
@@ -127,8 +130,22 @@ def calibrate() -> None:
 
 
 @calibrate.command("force")
-@click.option("--mass-g", "masses_g", type=float, multiple=True, default=(0, 100, 200, 500), show_default=True)
-@click.option("--valid-days", default=365, show_default=True, help="After how many days it is past its date.")
+@click.option(
+    "--mass-g",
+    "masses_g",
+    type=click.FloatRange(0, 1e6),
+    multiple=True,
+    default=(0, 100, 200, 500),
+    show_default=True,
+    help="A known mass; one option each.",
+)
+@click.option(
+    "--valid-days",
+    type=click.IntRange(1, 36_500),
+    default=365,
+    show_default=True,
+    help="After how many days it is past its date.",
+)
 @bench_option
 @yes_option
 @json_option
@@ -160,9 +177,29 @@ def calibrate_force_command(
 
 
 @calibrate.command("frame")
-@click.option("--force-N", "force_N", default=8.0, show_default=True, help="How hard to press the block.")
-@click.option("--block-mm-N", "block_mm_N", default=0.0, show_default=True, help="What the block itself gives.")
-@click.option("--valid-days", default=365, show_default=True)
+@click.option(
+    "--force-N",
+    "force_N",
+    type=click.FloatRange(0.001, 10_000),
+    default=8.0,
+    show_default=True,
+    help="How hard to press the block.",
+)
+@click.option(
+    "--block-mm-N",
+    "block_mm_N",
+    type=click.FloatRange(0, 10),
+    default=0.0,
+    show_default=True,
+    help="What the block itself gives.",
+)
+@click.option(
+    "--valid-days",
+    type=click.IntRange(1, 36_500),
+    default=365,
+    show_default=True,
+    help="After how many days it is past its date.",
+)
 @bench_option
 @yes_option
 @json_option

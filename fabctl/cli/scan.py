@@ -31,13 +31,24 @@ def command() -> None:
 @click.argument("words", nargs=-1, type=SPECIMEN_OR_FILE, metavar="[SPECIMEN] [CLOUD]")
 @click.option("--target", type=InFile(), help="Target mesh, for a cloud without a specimen.")
 @click.option(
+    "--predicted",
+    type=InFile(),
+    help="Deployed shape that a model foresaw, compared as well  [the specimen's deployed.ply].",
+)
+@click.option(
     "--scale",
     type=click.Choice(["free", "known", "markers"]),
     default="free",
     show_default=True,
     help="The cloud's scale: found from geometry, given by --unit-mm, or taken from a measured board.",
 )
-@click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
+@click.option(
+    "--unit-mm",
+    type=click.FloatRange(0, 1e9, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Millimetres in one unit of the cloud, with --scale known.",
+)
 @click.option(
     "--markers",
     type=InFile(),
@@ -66,13 +77,20 @@ def command() -> None:
     show_default=True,
     help="Rules of the alignment.",
 )
-@click.option("--tolerance-frac", type=click.FloatRange(min=0, min_open=True), help="Of the bounding-box diagonal.")
-@click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same answer.")
+@click.option("--tolerance-frac", type=click.FloatRange(0, 10, min_open=True), help="Of the bounding-box diagonal.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    default=0,
+    show_default=True,
+    help="The same seed gives the same answer.",
+)
 @bench_option
 @json_option
 def run_scan(
     words: tuple[str, ...],
     target: Path | None,
+    predicted: Path | None,
     scale: str,
     unit_mm: float,
     markers: Path | None,
@@ -105,7 +123,8 @@ def run_scan(
         raise UsageError("--bars and --model belong to --scale markers")
     if pictures is not None and model is None:
         raise UsageError(f"--pictures {pictures} belongs to --model, the scan's COLMAP text model")
-    predicted = None if specimen is None else specimen.design / "deployed.ply"
+    if predicted is None and specimen is not None and (specimen.design / "deployed.ply").is_file():
+        predicted = specimen.design / "deployed.ply"
     options: dict[str, Any] = {
         "scale": scale,
         "unit_mm": unit_mm,
@@ -123,22 +142,39 @@ def run_scan(
         "seed": seed,
     }
     if cloud is not None:
-        request = Request(cloud, mesh, predicted if predicted and predicted.is_file() else None, **options)
-        _run(here, request, specimen, as_json)
+        _run(here, Request(cloud, mesh, predicted, **options), specimen, as_json)
         return
     if specimen is None:
         raise UsageError("give the cloud's file")
-    fresh = _fetch(here, bench_name, specimen, seed)
-    _run(here, Request(fresh, mesh, predicted, **options), specimen, as_json)
+    fresh, source = _fetch(here, bench_name, specimen, seed)
+    _run(here, Request(fresh, mesh, predicted, **options), specimen, as_json, source)
 
 
 @command.command("batch")
 @click.argument("clouds", nargs=-1, required=True, type=InFile())
 @click.option("--target", type=InFile(), required=True, help="Target mesh of all the clouds.")
-@click.option("--scale", type=click.Choice(["free", "known"]), default="free", show_default=True)
-@click.option("--unit-mm", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True)
-@click.option("--tolerance-frac", type=click.FloatRange(min=0, min_open=True), help="Of the bounding-box diagonal.")
-@click.option("--seed", type=int, default=0, show_default=True)
+@click.option(
+    "--scale",
+    type=click.Choice(["free", "known"]),
+    default="free",
+    show_default=True,
+    help="The clouds' scale: found from geometry, or given by --unit-mm.",
+)
+@click.option(
+    "--unit-mm",
+    type=click.FloatRange(0, 1e9, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Millimetres in one unit of the cloud, with --scale known.",
+)
+@click.option("--tolerance-frac", type=click.FloatRange(0, 10, min_open=True), help="Of the bounding-box diagonal.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    default=0,
+    show_default=True,
+    help="The same seed gives the same answer.",
+)
 @json_option
 def run_batch(
     clouds: tuple[Path, ...],
@@ -157,7 +193,7 @@ def run_batch(
     for cloud in clouds:
         options: dict[str, Any] = {"scale": scale, "unit_mm": unit_mm, "tolerance_frac": tolerance_frac, "seed": seed}
         try:
-            run, body, code = _compared(here, Request(cloud, target, **options), None)
+            run, body, code = _compared(here, Request(cloud, target, **options), None, {})
         except (RefusedError, UsageError) as fault:  # one bad file must not lose the others
             rows.append(
                 {"cloud": str(cloud), "verdict": "undecided", "error": str(fault), "exit_code": fault.exit_code}
@@ -219,17 +255,18 @@ def _named(here: Workspace, words: tuple[str, ...], target: Path | None) -> tupl
     return here.specimen(words[0]), Path(words[1]) if len(words) == 2 else None
 
 
-def _fetch(here: Workspace, bench_name: str, specimen: Specimen, seed: int) -> Path:
-    """Ask the bench's scanner for a cloud of the specimen; return its file."""
+def _fetch(here: Workspace, bench_name: str, specimen: Specimen, seed: int) -> tuple[Path, dict[str, Any]]:
+    """Ask the bench's scanner for a cloud of the specimen; return its file, and who made it, for the record."""
     from fabctl.bench import open_bench
     from fabctl.config.bench import load_bench
 
     config = load_bench(bench_name, here.root)
     if config.scan is None:
         raise UsageError(f"bench {config.name} has no scan section; give the cloud's file")
+    source = {"bench": config.name, "simulated": config.is_simulated}
     with open_bench(here, config, f"scan of {specimen.name}") as bench:
         if config.scan.inbox is not None:
-            return _newest(Path(config.scan.inbox.replace("{state}", str(bench.state))))
+            return _newest(Path(config.scan.inbox.replace("{state}", str(bench.state)))), source
         assert config.scan.command is not None
         bench.lay(specimen.design)
         out = bench.state / "scans" / f"{specimen.name}-{seed}.ply"
@@ -248,7 +285,7 @@ def _fetch(here: Workspace, bench_name: str, specimen: Specimen, seed: int) -> P
         done = subprocess.run(asked, capture_output=True, text=True, check=False)
         if done.returncode or not out.is_file():
             raise _ScannerFailed(f"the scanner made no cloud (exit {done.returncode}): {done.stderr.strip()[-500:]}")
-        return out
+        return out, source
 
 
 class _ScannerFailed(FabctlError):
@@ -266,15 +303,19 @@ def _newest(inbox: Path) -> Path:
     return max(found, key=lambda p: p.stat().st_mtime)
 
 
-def _run(here: Workspace, request: Request, specimen: Specimen | None, as_json: bool) -> None:
-    """Compare, write the run record, show the result; return the exit code."""
-    run, body, code = _compared(here, request, specimen)
+def _run(
+    here: Workspace, request: Request, specimen: Specimen | None, as_json: bool, source: dict[str, Any] | None = None
+) -> None:
+    """Compare, write the run record, show the result; a no ends with its exit code."""
+    run, body, code = _compared(here, request, specimen, source or {})
     page = run.artefact("report.html")
     data = {"run": run.run_id, "folder": str(run.path), "report": str(page), **body}
     show(data, as_json, _lines(body, page), code, _sentence(body))
 
 
-def _compared(here: Workspace, request: Request, specimen: Specimen | None) -> tuple[RunFolder, dict[str, Any], int]:
+def _compared(
+    here: Workspace, request: Request, specimen: Specimen | None, source: dict[str, Any]
+) -> tuple[RunFolder, dict[str, Any], int]:
     """Compare and write the run record; return it with the result and the exit code."""
     from fabctl.records.folder import start_run
     from fabctl.reports.scan import write_scan_report
@@ -284,7 +325,7 @@ def _compared(here: Workspace, request: Request, specimen: Specimen | None) -> t
     if missing:
         raise UsageError(f"no such file: {', '.join(missing)}")
     name = None if specimen is None else specimen.name
-    config = {k: getattr(request, k) for k in ("scale", "unit_mm", "mode", "tolerance_frac")}
+    config = {k: getattr(request, k) for k in ("scale", "unit_mm", "mode", "tolerance_frac")} | source
     run = start_run(here.runs, "scan", specimen=name, inputs=request.files(), config=config, seed=request.seed)
     log, live = run.log_events(), progress()
 

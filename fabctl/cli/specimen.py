@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,10 @@ from fabctl.cli.common import json_option, lab, show
 from fabctl.cli.paths import SPECIMEN, InFile
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from design.findings import Finding
     from fabctl.workspace import Specimen
 
 
@@ -59,27 +62,31 @@ def show_specimen(name: str, as_json: bool) -> None:
 @command.command("note")
 @click.argument("name", type=SPECIMEN)
 @click.argument("facts", nargs=-1, required=True, metavar="KEY=VALUE…")
+@click.option("--free", is_flag=True, help="Allow other keys than the known ones; no run or report reads them.")
 @json_option
-def note(name: str, facts: tuple[str, ...], as_json: bool) -> None:
-    """Write facts about a specimen: thickness_mm=2.31 batch=B7."""
-    specimen = lab().specimen(name)
-    parsed = dict(_fact(text) for text in facts)
-    specimen.note(**parsed)
-    show(specimen.record(), as_json, [f"{name}: noted {', '.join(parsed)}"])
+def note(name: str, facts: tuple[str, ...], free: bool, as_json: bool) -> None:
+    """Write facts about a specimen: thickness_mm=2.31 batch=B7.
+
+    Known facts are thickness_mm, batch, rest_h, deployed_utc and remark.
+    """
+    from fabctl.notes import read_notes
+
+    specimen, noted = lab().specimen(name), read_notes(facts, free)
+    specimen.note(**noted)
+    show(specimen.record(), as_json, [f"{name}: noted {', '.join(noted)}"])
 
 
-def _fact(text: str) -> tuple[str, Any]:
-    key, sign, value = text.partition("=")
-    if not sign or not key.isidentifier():
-        raise click.UsageError(f"{text!r} is not KEY=VALUE")
-    if key in ("id", "made_utc", "design"):
-        raise click.UsageError(f"{key} was given at the cut and stays")
-    try:
-        number = json.loads(value)
-    except ValueError:
-        return key, value
-    # NaN and Infinity pass json.loads, and a record must not hold them.
-    return key, value if isinstance(number, float) and number - number != 0 else number
+def _why_no_id(image: NDArray[np.uint8], path: Path) -> Finding:
+    """Return why the picture shows no id: a mirrored one, or none at all."""
+    from design.findings import Finding
+    from fabctl.vision.ids import read_ids
+
+    turned = read_ids(image[:, ::-1].copy())
+    if turned:
+        text = f"{turned[0].specimen} is seen in a mirror: the picture, or the specimen, is the other way round"
+        return Finding("ID-MIRRORED", text, where=str(path), hint="photograph the engraved side, without mirroring")
+    hint = "nearer (3 px a module at least), sharper, less tilted, no glare"
+    return Finding("ID-NONE", "no specimen id in the picture", where=str(path), hint=hint)
 
 
 @command.command("read")
@@ -87,7 +94,7 @@ def _fact(text: str) -> tuple[str, Any]:
 @json_option
 def read(image: Path, as_json: bool) -> None:
     """Read the engraved ids in a picture, and say which runs they have."""
-    from design.findings import Finding, errors
+    from design.findings import errors
     from fabctl.errors import RefusedError
     from fabctl.files import picture_of
     from fabctl.vision.ids import read_ids
@@ -97,11 +104,8 @@ def read(image: Path, as_json: bool) -> None:
     found = picture_findings(frame.image, frame.source)
     ids = [] if errors(found) else read_ids(frame.image)
     if not ids:
-        hint = "nearer (3 px a module at least), sharper, less tilted, no glare"
-        none = (
-            [] if errors(found) else [Finding("ID-NONE", "no specimen id in the picture", where=str(image), hint=hint)]
-        )
-        raise RefusedError(f"{image}: nothing to read", [*found, *none])
+        reasons = found if errors(found) else [*found, _why_no_id(frame.image, image)]
+        raise RefusedError(f"{image}: nothing to read", reasons)
     place = lab()
     rows = []
     for engraved in ids:

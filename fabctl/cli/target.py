@@ -38,10 +38,10 @@ def list_targets(as_json: bool) -> None:
     required=True,
     help="OBJ, PLY or STL file to write.",
 )
-@click.option("--radius-mm", type=click.FloatRange(1), help="Radius of the sphere, disk or tube.")
-@click.option("--height-mm", type=click.FloatRange(0), help="Height of the hills or of the tube.")
+@click.option("--radius-mm", type=click.FloatRange(1, 10_000), help="Radius of the sphere, disk or tube.")
+@click.option("--height-mm", type=click.FloatRange(0, 10_000), help="Height of the hills or of the tube.")
 @click.option("--half-angle-deg", type=click.FloatRange(5, 150), help="Half-angle of a cap.")
-@click.option("--edge-mm", type=click.FloatRange(0.05), help="Edge length of the mesh.")
+@click.option("--edge-mm", type=click.FloatRange(0.05, 10_000), help="Edge length of the mesh.")
 @json_option
 def make_target(
     name: str,

@@ -66,7 +66,13 @@ class BenchConfig(Model):
     camera: CameraConfig | None = None
     specimen_slot: str | None = None
     deployment: Literal["by_hand", "automatic"] = "by_hand"
+    simulated: bool = False
     simulators: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Return whether its devices are simulators: the file says so, or lists them."""
+        return self.simulated or bool(self.simulators)
 
 
 def find(kind: str, name: str, home: Path) -> Path:

@@ -68,10 +68,12 @@ class Load(_Reach):
 
 
 class Hold(Model):
-    """Stand still: creep of the frame, relaxation of the specimen."""
+    """Stand still, and see the force relax; with `force_N` keep the net force instead, and see the specimen creep."""
 
     step: Literal["hold"]
     time_s: Positive
+    force_N: Positive | None = None
+    speed_mm_s: Positive = 0.5
 
 
 class Unload(Model):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -27,6 +27,7 @@ from fabctl.bench import Bench
 from fabctl.config.bench import BenchConfig, LaserConfig
 from fabctl.config.material import MaterialConfig
 from fabctl.cut.execute import check_on_board, minutes, no_keys, run_plan
+from fabctl.cut.kept import design_files, kept
 from fabctl.cut.place import Affine, Origin, homed_mm, placement
 from fabctl.cut.plan import CutPlan, frame_lines, plan_cut, program_times
 from fabctl.cut.preflight import Sheet
@@ -129,23 +130,24 @@ def cut(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, dry_run: bool
     """Cut `order` on `bench`; return what came of it.
 
     Raises `RefusedError` with all findings before anything moves, `Stopped` where the operator said no or stopped it,
-    and the driver's errors where the device failed; in a run, the record says the same.
+    and the driver's errors where the device failed; the run's record says the same, also where nothing began.
     """
     log = WireLog()
     try:
-        with laser_on(bench, log) as laser:
-            plan = _plan(laser, bench, order, SAMPLE_ID)
-            if any(finding.code == "CUT-ZERO" for finding in plan.findings):
-                order = replace(order, frame=True)  # where zero is, only the operator knows: let it be seen
-            _tell_findings(plan.findings, desk.emit)
-            _refuse(plan.findings)
-            if dry_run:
-                if order.check and laser.report().state == "Idle":
-                    check_on_board(laser, plan.lines)
-                return CutDone(plan, None, None, summary(plan, identity_of(laser)))
-            screen = question(plan, order, laser_config(bench), homes(laser, bench, order))
-            if not desk.ask(screen):
-                raise Stopped("not cut: the operator said no")
+        with ExitStack() as stack:
+            with kept(lab, bench, order, dry_run):
+                laser = stack.enter_context(laser_on(bench, log))
+                plan = _plan(laser, bench, order, SAMPLE_ID)
+                if any(finding.code == "CUT-ZERO" for finding in plan.findings):
+                    order = replace(order, frame=True)  # where zero is, only the operator knows: let it be seen
+                _tell_findings(plan.findings, desk.emit)
+                _refuse(plan.findings)
+                if dry_run:
+                    if order.check and laser.report().state == "Idle":
+                        check_on_board(laser, plan.lines)
+                    return CutDone(plan, None, None, summary(plan, identity_of(laser)))
+                if not desk.ask(question(plan, order, laser_config(bench), homes(laser, bench, order))):
+                    raise Stopped("not cut: the operator said no")
             return _cut_now(lab, bench, order, desk, laser, log)
     finally:
         log.close()
@@ -244,11 +246,12 @@ def summary(plan: CutPlan, identity: Identity) -> dict[str, Any]:
 
 
 def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: Laser, log: WireLog) -> CutDone:
-    if order.eye is not None:
-        order.eye.look_again()
-    specimen = lab.new_specimen(order.design) if order.kind == "cut" else None
-    plan = _plan(laser, bench, order, specimen.name if specimen is not None else SAMPLE_ID)
-    _refuse(plan.findings)
+    with kept(lab, bench, order):
+        if order.eye is not None:
+            order.eye.look_again()
+        specimen = lab.new_specimen(order.design) if order.kind == "cut" else None
+        plan = _plan(laser, bench, order, specimen.name if specimen is not None else SAMPLE_ID)
+        _refuse(plan.findings)
     run = start_run(
         lab.runs,
         order.kind,
@@ -274,11 +277,6 @@ def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: L
     if specimen is not None:
         bench.lay(specimen.design)
     return CutDone(plan, specimen, run, result)
-
-
-def design_files(design: Path) -> list[Path]:
-    """Return the files of a design folder (or the one file that says what is cut), for the manifest."""
-    return [design] if design.is_file() else sorted(path for path in design.iterdir() if path.is_file())
 
 
 @contextmanager

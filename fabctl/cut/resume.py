@@ -7,6 +7,7 @@ goes on from the place it reported last. Asked before anything moves.
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from fabctl.cut.job import (
     CutDone,
     CutOrder,
     Desk,
-    design_files,
     execute,
     identity_of,
     laser_config,
@@ -27,6 +27,7 @@ from fabctl.cut.job import (
     recorded,
     summary,
 )
+from fabctl.cut.kept import design_files, kept
 from fabctl.cut.place import Affine
 from fabctl.cut.plan import CutPlan, program_times
 from fabctl.cut.preflight import preflight
@@ -49,18 +50,20 @@ def resume(lab: Workspace, bench: Bench, order: CutOrder, path: Path, desk: Desk
     """
     before = _interrupted(path)
     specimen = lab.specimen(str(before.manifest()["specimen"]))
-    found = against_resuming(lab, before, specimen, order.design)
-    if found:
-        raise RefusedError("the cut cannot be resumed", found)
     log = WireLog()
     try:
-        with laser_on(bench, log) as laser:
-            plan, place, will_home = _plan_rest(laser, bench, order, before)
-            facts = {**summary(plan, identity_of(laser)), "resumed": before.run_id, "position_kept": not will_home}
-            if dry_run:
-                return CutDone(plan, specimen, None, facts)
-            if not desk.ask(_question(before, plan, place, will_home)):
-                raise Stopped("not resumed: the operator said no")
+        with ExitStack() as stack:
+            with kept(lab, bench, order, dry_run, {"asked_to_resume": before.run_id}):
+                found = against_resuming(lab, before, specimen, order.design)
+                if found:
+                    raise RefusedError("the cut cannot be resumed", found)
+                laser = stack.enter_context(laser_on(bench, log))
+                plan, place, will_home = _plan_rest(laser, bench, order, before)
+                facts = {**summary(plan, identity_of(laser)), "resumed": before.run_id, "position_kept": not will_home}
+                if dry_run:
+                    return CutDone(plan, specimen, None, facts)
+                if not desk.ask(_question(before, plan, place, will_home)):
+                    raise Stopped("not resumed: the operator said no")
             config: dict[str, Any] = {**before.manifest()["config"], "resumed": before.run_id, "plan": facts}
             run = start_run(
                 lab.runs, "cut", specimen=specimen.name, inputs=design_files(specimen.design), config=config

@@ -31,6 +31,8 @@ SUMMARY = (
     "hysteresis_ratio",
     "barrier_mJ",
     "relaxation_ratio",
+    "creep_mm",
+    "creep_ratio",
     "residual_mm",
     "recovery_ratio",
 )
@@ -89,6 +91,10 @@ def strokes_of(samples: Samples) -> list[tuple[int, int, Strokes]]:
         load, unload, hold = (own & (samples.step == step) for step in ("load", "unload", "hold"))
         if load.sum() < 10:
             continue
+        if unload.any():
+            hold &= np.arange(len(hold)) < np.flatnonzero(unload)[0]  # a rest afterwards holds nothing
+        zeroed = np.flatnonzero((samples.point == point) & (samples.step == "zero"))
+        zeroed = zeroed[zeroed < np.flatnonzero(load)[0]]
         found.append(
             (
                 point,
@@ -100,6 +106,9 @@ def strokes_of(samples: Samples) -> list[tuple[int, int, Strokes]]:
                     samples.force_N[unload],
                     samples.time_s[hold],
                     samples.force_N[hold],
+                    float(samples.position_mm[zeroed[-1]]) if len(zeroed) else None,
+                    float(samples.force_N[zeroed[-1]]) if len(zeroed) else 0.0,
+                    samples.position_mm[hold],
                 ),
             )
         )
@@ -145,6 +154,7 @@ def _one(numbered: Numbered) -> dict[str, Any]:
         "curve": numbered.curve,
         "contact_mm": contact.position_mm,
         "contact_se_mm": contact.se_mm,
+        "counted_from": contact.kind,
         "contact_spread_mm": contact.spread_mm,
         "contact_others_mm": dict(contact.others_mm),
         "noise_N": contact.noise_N,

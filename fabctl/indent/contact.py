@@ -39,7 +39,8 @@ class Contact:
 
     `position_mm` is None where it was not found; `reason` says why. `slope_N_mm` is the stiffness at contact with its
     standard error; None for a Hertzian start, which has none. `drift_N_mm` is the slope of the free part where it is
-    evident, else 0.
+    evident, else 0. `kind` is `zero` where the curve begins under a preload and depth is counted from the method's
+    zero, at which the force was `start_N`.
     """
 
     position_mm: float | None
@@ -52,6 +53,7 @@ class Contact:
     baseline_N: float = 0.0
     baseline_N_mm: float = 0.0
     drift_N_mm: float = 0.0
+    start_N: float = 0.0
     others_mm: tuple[tuple[str, float], ...] = ()
 
     @property

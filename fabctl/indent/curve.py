@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fabctl.indent.contact import Contact, find_contact
+from fabctl.indent.freepart import noise_of_N
 
 Reals = NDArray[np.float64]
 
@@ -20,12 +21,18 @@ SMOOTH_MM = 0.6  # half the width over which an extremum is fitted
 PROMINENCE_SIGMA = 6.0  # a peak must stand out of the noise by so much
 SNAP_SIGMA = 8.0  # a snap is a fall of the force between two samples of at least so many noises
 SNAP_RATE = 6.0  # and of at least so many times the steepest change elsewhere
+FOLLOWED_MM = 0.01  # a stage that went down by so much while holding has followed a force
 T95 = 1.96
+PRELOADED_SIGMA = 4.0  # a force of so many noises at the method's zero is a preload
+ENOUGH_COUNT = 36  # samples of a loading that its figures may rest on
 
 
 @dataclass(frozen=True, slots=True)
 class Strokes:
-    """The samples of one curve: loading, holding at the end of it, unloading. Force net of tare."""
+    """The samples of one curve: loading, holding at the end of it, unloading. Force net of tare.
+
+    `zero_position_mm` and `zero_N` are where a zero step of the method counted depth from, None without one.
+    """
 
     load_position_mm: Reals
     load_N: Reals
@@ -33,6 +40,9 @@ class Strokes:
     unload_N: Reals
     hold_time_s: Reals = field(default_factory=lambda: np.zeros(0))
     hold_N: Reals = field(default_factory=lambda: np.zeros(0))
+    zero_position_mm: float | None = None
+    zero_N: float = 0.0
+    hold_position_mm: Reals = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +82,8 @@ class CurveResult:
     hysteresis_ratio: float | None = None
     barrier_mJ: float | None = None
     relaxation_ratio: float | None = None
+    creep_mm: float | None = None
+    creep_ratio: float | None = None
     residual_mm: float | None = None
     recovery_ratio: float | None = None
     reasons: dict[str, str] = field(default_factory=dict)
@@ -84,7 +96,7 @@ class CurveResult:
 def analyse_curve(strokes: Strokes, compliance_mm_N: float = 0.0, secant_mm: float = 2.0) -> CurveResult:
     """Return what the curve says, the frame's `compliance_mm_N` removed from every depth."""
     u = strokes.load_position_mm - compliance_mm_N * strokes.load_N
-    contact = find_contact(u, strokes.load_N)
+    contact = _counted_from(u, strokes, compliance_mm_N)
     if contact.position_mm is None:
         return CurveResult(contact, reasons={"contact_mm": contact.reason})
     depth = u - contact.position_mm
@@ -100,7 +112,7 @@ def analyse_curve(strokes: Strokes, compliance_mm_N: float = 0.0, secant_mm: flo
     found |= _energies(depth, load_N, back, unload_N, reasons)
     found |= _barrier(depth, load_N, contact.noise_N, found, reasons)
     found |= _recovery(depth, back, unload_N, contact.noise_N, reasons)
-    found |= _relaxation(strokes, free_N, reasons)
+    found |= _held(strokes, free_N, contact.position_mm, compliance_mm_N, reasons)
     return CurveResult(
         contact,
         depth_max_mm=float(depth.max()),
@@ -112,6 +124,18 @@ def analyse_curve(strokes: Strokes, compliance_mm_N: float = 0.0, secant_mm: flo
         unload_N=unload_N,
         **found,  # type: ignore[arg-type]
     )
+
+
+def _counted_from(u: Reals, strokes: Strokes, compliance_mm_N: float) -> Contact:
+    """Return the contact, or where the curve begins under a preload the method's own zero."""
+    contact = find_contact(u, strokes.load_N)
+    if contact.position_mm is not None or strokes.zero_position_mm is None or len(u) < ENOUGH_COUNT:
+        return contact
+    noise_N, _ = noise_of_N(u, strokes.load_N)
+    if strokes.zero_N < PRELOADED_SIGMA * noise_N:
+        return contact
+    zero_mm = strokes.zero_position_mm - compliance_mm_N * strokes.zero_N
+    return Contact(zero_mm, kind="zero", noise_N=noise_N, start_N=strokes.zero_N)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,16 +169,18 @@ def _stiffness(
     if contact.slope_N_mm is not None and contact.slope_se_N_mm is not None:
         found["stiffness_initial_N_mm"] = Valued(contact.slope_N_mm, T95 * contact.slope_se_N_mm)
     else:
-        reasons["stiffness_initial_N_mm"] = "a Hertzian contact begins with slope zero"
+        begins = "the curve begins under a preload" if contact.kind == "zero" else ""
+        reasons["stiffness_initial_N_mm"] = begins or "a Hertzian contact begins with slope zero"
     at = local_fit(depth, load_N, secant_mm, min(LOCAL_MM, 0.2 * secant_mm))
     if at is None:
         reasons["stiffness_secant_N_mm"] = f"the loading ends before {secant_mm:g} mm below contact"
     else:
         # An error of the contact moves the depth at which the force is read, and the depth it is divided by.
-        shift = (at.slope_N_mm - at.force_N / secant_mm) * (contact.se_mm or 0.0)
+        rise_N = at.force_N - contact.start_N
+        shift = (at.slope_N_mm - rise_N / secant_mm) * (contact.se_mm or 0.0)
         doubt = T95 * float(np.hypot(at.force_se_N, shift)) / secant_mm
         # Whether the drift before contact goes on under load, nobody knows: it widens the interval and stays in.
-        found["stiffness_secant_N_mm"] = Valued(at.force_N / secant_mm, doubt + abs(contact.drift_N_mm))
+        found["stiffness_secant_N_mm"] = Valued(rise_N / secant_mm, doubt + abs(contact.drift_N_mm))
     places = np.arange(LOCAL_MM, float(depth.max()) - LOCAL_MM, LOCAL_MM / 2)
     slopes = [fit for place in places if (fit := local_fit(depth, load_N, float(place))) is not None]
     if slopes:
@@ -299,16 +325,26 @@ def _recovery(depth: Reals, back: Reals, unload_N: Reals, noise_N: float, reason
     return {"residual_mm": free.position_mm, "recovery_ratio": 1.0 - free.position_mm / float(depth.max())}
 
 
-def _relaxation(strokes: Strokes, free_N: float, reasons: dict[str, str]) -> dict[str, object]:
-    """Return which share of the force is lost while the stage holds."""
+def _held(
+    strokes: Strokes, free_N: float, contact_mm: float, compliance_mm_N: float, reasons: dict[str, str]
+) -> dict[str, object]:
+    """Return which share of the force is lost where the stage stands, or how far it follows a force that is kept."""
     count = len(strokes.hold_N)
     if count < 20:
-        return _none(reasons, "the method holds nowhere, or too shortly", "relaxation_ratio")
+        why = "the method holds nowhere, or too shortly"
+        return _none(reasons, why, "relaxation_ratio", "creep_mm", "creep_ratio")
     edge = max(3, count // 50)
-    begin, end = float(np.mean(strokes.hold_N[:edge])) - free_N, float(np.mean(strokes.hold_N[-edge:])) - free_N
+    begin, end = (float(np.mean(part)) - free_N for part in (strokes.hold_N[:edge], strokes.hold_N[-edge:]))
     if begin <= 0:
-        return _none(reasons, "no force is held", "relaxation_ratio")
-    return {"relaxation_ratio": (begin - end) / begin}
+        return _none(reasons, "no force is held", "relaxation_ratio", "creep_mm", "creep_ratio")
+    place = strokes.hold_position_mm
+    if len(place) != count or place[-1] - place[0] < FOLLOWED_MM:
+        _none(reasons, "the stage stood: the force relaxed, nothing crept", "creep_mm", "creep_ratio")
+        return {"relaxation_ratio": (begin - end) / begin}
+    depth = place - compliance_mm_N * strokes.hold_N - contact_mm
+    first, last = float(np.mean(depth[:edge])), float(np.mean(depth[-edge:]))
+    _none(reasons, "the force was kept: the specimen crept", "relaxation_ratio")
+    return {"creep_mm": last - first, "creep_ratio": (last - first) / first if first > 0 else None}
 
 
 def _smooth(depth: Reals, force_N: Reals, half_mm: float) -> Reals:

@@ -44,16 +44,16 @@ def find_free(u: Reals, f: Reals) -> Free | str:
     """Return the free part of a loading, position `u` (n,) rising, or why there is none."""
     if len(u) < 3 * FREE_MIN:
         return f"only {len(u)} samples in the loading"
-    noise_N, slow_ratio = _noise_N(u, f)
-    slope_N_mm, drift_N_mm = _drift(u, f, noise_N)
+    first_N, slow_ratio = noise_of_N(u, f)
+    slope_N_mm, drift_N_mm = _drift(u, f, first_N)
     straight = f - slope_N_mm * (u - u[0])
     drifts = f", a drift of {1000 * slope_N_mm:.1f} mN/mm taken off" if slope_N_mm else ""
-    if _means(straight).max() - np.median(straight[:HEAD_COUNT]) < SIGNAL * noise_N / np.sqrt(WIDTH):
-        return f"the force never leaves the noise of {1000 * noise_N:.1f} mN{drifts}"
-    found = _followed(straight, noise_N, slow_ratio)
+    if _means(straight).max() - np.median(straight[:HEAD_COUNT]) < SIGNAL * first_N / np.sqrt(WIDTH):
+        return f"the force never leaves the noise of {1000 * first_N:.1f} mN{drifts}"
+    found = _followed(straight, first_N, slow_ratio)
     if isinstance(found, str):
         return found + drifts
-    start, level_N, noise_N = found
+    start, level_N, settled_N = found
     before = _few(u, f, start)
     if before is not None:
         return before
@@ -63,7 +63,7 @@ def find_free(u: Reals, f: Reals) -> Free | str:
             f"before the rise the force already climbs by {1000 * slope_N_mm:.1f} mN/mm, after it by "
             f"{1000 * steepest_N_mm:.1f}: the curve begins in contact, or the load cell drifts too much"
         )
-    return Free(start, level_N, noise_N, slope_N_mm, drift_N_mm)
+    return Free(start, level_N, settled_N, slope_N_mm, drift_N_mm)
 
 
 def _followed(f: Reals, noise_N: float, slow_ratio: float) -> tuple[int, float, float] | str:
@@ -153,7 +153,7 @@ def _means(f: Reals) -> Reals:
     return np.convolve(f, np.full(WIDTH, 1 / WIDTH), "valid")
 
 
-def _noise_N(u: Reals, f: Reals) -> tuple[float, float]:
+def noise_of_N(u: Reals, f: Reals) -> tuple[float, float]:
     """Return (noise that counts for means of some samples, its ratio to the noise from one sample to the next).
 
     They are the same where samples err each for itself; a load cell behind a filter, or one that wanders, errs slowly.

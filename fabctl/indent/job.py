@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from fabctl.priority import before_other_work
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Specimen, Workspace
 
+CONDITIONS = ("thickness_mm", "batch", "rest_h")
 DRIFT_TOLD_FRAC = 0.01  # a drift of so much of the stiffness is told
 
 
@@ -49,6 +51,7 @@ class IndentPlan:
     sample_hz: float
     findings: tuple[Finding, ...]
     resumes: str | None = None
+    conditions: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def time_s(self) -> float:
@@ -71,7 +74,12 @@ class Steering:
 
 
 def plan_test(
-    lab: Workspace, specimen: Specimen, method: str, bench: BenchConfig, resume: RunFolder | None = None
+    lab: Workspace,
+    specimen: Specimen,
+    method: str,
+    bench: BenchConfig,
+    resume: RunFolder | None = None,
+    facts: Mapping[str, Any] | None = None,
 ) -> IndentPlan:
     """Return what would be done, with everything that speaks against it; touches no device."""
     refuse_without(bench, "rig")
@@ -88,6 +96,8 @@ def plan_test(
     predicted = read_predicted(response) if response.is_file() else None
     calibration = load_calibration(lab.root, bench.name)
     findings += check(steps, read, bench.rig, predicted, "move_stage" in registers.commands)
+    found = conditions(specimen.record(), facts or {})
+    findings += unrecorded(found)
     findings += calibration.findings() if calibration is not None else _uncalibrated(bench.name)
     return IndentPlan(
         specimen,
@@ -102,6 +112,7 @@ def plan_test(
         read.sample_hz or bench.rig.sample_hz,
         tuple(findings),
         resume.run_id if resume is not None else None,
+        found,
     )
 
 
@@ -118,7 +129,6 @@ def run_test(
     bench: Bench,
     emit: Emit = silent,
     steering: Steering | None = None,
-    facts: Mapping[str, Any] | None = None,
     clock: Clock | None = None,
 ) -> RunFolder:
     """Carry the plan out and return its run, closed; a run that went wrong is closed as such, and the error raised."""
@@ -127,7 +137,7 @@ def run_test(
     with contextlib.closing(open_indenter(bench.url("rig"), plan.registers)) as rig:
         identity = rig.identify()
         _refuse_rig(plan, identity)
-        config = _config(plan, identity, {**rig.environment(), **(facts or {})})
+        config = _config(plan, identity, rig.environment(), bench.config.is_simulated)
         inputs = [plan.method_path, plan.map_path]
         inputs += [p for p in (plan.specimen.design / "response.csv",) if p.is_file()]
         run = start_run(lab.runs, "indent", specimen=plan.specimen.name, inputs=inputs, config=config)
@@ -179,6 +189,28 @@ def result_of(run: RunFolder, plan: IndentPlan, ending: Ending) -> dict[str, Any
     if plan.predicted is not None and plan.predicted.depth_mm[-1] >= plan.method.secant_mm:
         body["predicted_secant_N_mm"] = plan.predicted.secant_N_mm(plan.method.secant_mm)
     return body
+
+
+def conditions(record: Mapping[str, Any], facts: Mapping[str, Any], now: datetime | None = None) -> dict[str, Any]:
+    """Return what is known of the specimen as it is tested: its record, what the operator says, and how long it rested.
+
+    The rest since its deployment follows from `deployed_utc` where nobody gives `rest_h`.
+    """
+    known = {key: record[key] for key in (*CONDITIONS, "deployed_utc") if record.get(key) is not None}
+    known |= {key: value for key, value in facts.items() if value is not None}
+    with contextlib.suppress(KeyError, ValueError, TypeError):
+        since = datetime.fromisoformat(str(known["deployed_utc"])).astimezone(UTC)
+        known.setdefault("rest_h", round(((now or datetime.now(UTC)) - since).total_seconds() / 3600, 2))
+    return known
+
+
+def unrecorded(known: Mapping[str, Any]) -> list[Finding]:
+    """Say which conditions of a test nobody has written down: rubber depends on them."""
+    lacking = [name for name in CONDITIONS if name not in known]
+    if not lacking:
+        return []
+    hint = "`fabctl specimen note S-… thickness_mm=2.31 batch=B7`, or --thickness-mm, --batch and --rest-h"
+    return [Finding("INDENT-CONDITIONS", f"not recorded: {', '.join(lacking)}", "warning", hint=hint)]
 
 
 def _drifting(curves: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
@@ -254,17 +286,16 @@ def _refuse_rig(plan: IndentPlan, identity: Identity) -> None:
         raise RefusedError(f"{identity.model} cannot run method {plan.method.name}", found)
 
 
-def _config(plan: IndentPlan, identity: Identity, facts: Mapping[str, Any]) -> dict[str, Any]:
+def _config(plan: IndentPlan, identity: Identity, air: Mapping[str, float], simulated: bool) -> dict[str, Any]:
     """Return what is frozen into the run: method, plan, rig, calibration, and the conditions."""
-    record = plan.specimen.record()
-    known = {key: record[key] for key in ("thickness_mm", "batch", "rest_h", "deployed_utc") if key in record}
     return {
         "method": plan.method.model_dump(mode="json"),
         "plan": [asdict(action) for action in plan.actions],
         "rig": {**asdict(identity), "map": plan.registers.name, "indenter_radius_mm": plan.rig.indenter_radius_mm},
+        "simulated": simulated,
         "sample_hz": plan.sample_hz,
         "calibration": plan.calibration.as_dict() if plan.calibration is not None else None,
-        "conditions": {**known, **facts},
+        "conditions": {**air, **plan.conditions},
         "resumes": plan.resumes,
         "findings": [finding.as_dict() for finding in plan.findings],
     }

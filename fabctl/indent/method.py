@@ -89,7 +89,8 @@ def _expanded(step: Simple) -> Iterator[Action]:
     elif isinstance(step, Unload):
         yield Action("unload", step.speed_mm_s, step.depth_mm, step.force_N, curve=-2)
     elif isinstance(step, Hold):
-        yield Action("hold", time_s=step.time_s, curve=-2)
+        speed = step.speed_mm_s if step.force_N is not None else 0.0
+        yield Action("hold", speed, force_N=step.force_N, time_s=step.time_s, curve=-2)
     elif isinstance(step, Wait):
         yield Action("wait", message=step.message)
     else:
@@ -108,10 +109,12 @@ def _cycles(step: Cycles) -> Iterator[Action]:
 
 def _numbered(found: Sequence[Action]) -> list[Action]:
     """Number the curves: every loading begins one, what belongs to it follows."""
-    numbered, curve = [], 0
+    numbered: list[Action] = []
+    curve = 0
     for action in found:
         curve += action.curve == -1
-        numbered.append(replace(action, curve=curve if action.curve else 0))
+        rests = action.kind == "hold" and bool(numbered) and numbered[-1].kind == "unload"
+        numbered.append(replace(action, curve=curve if action.curve and not rests else 0))
     return numbered
 
 
@@ -223,8 +226,9 @@ def check(
     deepest = max((a.depth_mm for a in plan if a.kind == "load" and a.depth_mm is not None), default=None)
     if predicted is None:
         found.append(Finding("METHOD-NO-PREDICTION", "no predicted response to check the method against", "warning"))
-    elif deepest is not None:
-        found += _against(predicted, deepest, method, rig)
+    else:
+        found += _out_of_reach(plan, predicted)
+        found += _against(predicted, deepest, method, rig) if deepest is not None else ()
     return found
 
 
@@ -255,9 +259,23 @@ def _against(predicted: Predicted, deepest_mm: float, method: MethodConfig, rig:
         )
 
 
+def _out_of_reach(plan: Sequence[Action], predicted: Predicted) -> Iterator[Finding]:
+    """Say which forces the specimen is predicted never to answer with: the stage would go on to its travel's end."""
+    most_N = float(predicted.load_N.max())
+    for kind, force_N in sorted({(a.kind, a.force_N) for a in plan if a.force_N is not None and a.kind != "unload"}):
+        if force_N > most_N:
+            yield Finding(
+                "METHOD-OUT-OF-REACH",
+                f"{kind} to {force_N:g} N: down to {predicted.depth_mm[-1]:g} mm the specimen is predicted to answer "
+                f"with {most_N:.3g} N at most",
+                "warning",
+                hint="a smaller force, or a depth instead",
+            )
+
+
 def _order(plan: Sequence[Action]) -> Iterator[Finding]:
     """Say where a step needs another before it."""
-    tared = found_contact = False
+    tared = found_contact = pressed = touching = False
     for k, action in enumerate(plan):
         where = f"step {k + 1} ({action.kind})"
         if action.kind == "travel":
@@ -272,3 +290,23 @@ def _order(plan: Sequence[Action]) -> Iterator[Finding]:
                 )
         elif action.kind in ("load", "preload", "zero", "unload") and not found_contact:
             yield Finding("METHOD-APPROACH", "no contact is known here", where=where, hint="add {step: approach}")
+        if action.kind == "tare" and touching:
+            text = "a tare while the specimen is pressed would take its force for zero"
+            yield Finding("METHOD-TARE-PRESSED", text, where=where, hint="unload before it")
+        if action.kind == "hold" and action.force_N is not None and not touching:
+            text = f"{action.force_N:g} N are to be held where nothing is pressed"
+            yield Finding("METHOD-HOLD", text, where=where, hint="load to that force before it")
+        touching = _touches(action, touching)
+        if action.kind == "load" and pressed:
+            text = "this curve begins under a preload: without a zero after it nothing can be counted from contact"
+            yield Finding("METHOD-PRELOAD", text, "warning", where=where, hint="add {step: zero} after the preload")
+        pressed = action.kind == "preload" or (pressed and action.kind in ("hold", "wait", "tare"))
+
+
+def _touches(action: Action, before: bool) -> bool:
+    """Tell whether the indenter stands in contact after an action; `before` is how it stood."""
+    if action.kind in ("load", "preload"):
+        return True
+    if action.kind == "unload":
+        return action.depth_mm is not None or action.force_N is not None
+    return before and action.kind not in ("approach", "travel")

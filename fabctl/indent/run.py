@@ -29,6 +29,7 @@ STANDING_MM = 1.0  # the safe heights of two methods differ by less; a pressed s
 HARMLESS = ("unhomed", "restarted")  # what a controller says after it was switched on
 FREE_S, FREE_SIGMA, FREE_FRAC = 0.25, 4.0, 0.1
 MORE_ROOM_COUNT = 6
+KEEP_S, KEEP_FRAC, KEEP_OVER_FRAC, KEEP_STEP_MM = 0.5, 0.005, 0.1, 0.1  # how a force is kept: looked at twice a second
 
 
 class NoContact(FabctlError):
@@ -55,14 +56,17 @@ def left_behind(now: Sample, safe_height_mm: float) -> list[Finding]:
     A tare taken on a pressed specimen would make every figure wrong, and the approach would press on from there.
     """
     found = []
-    latched = [fault for fault in now.faults if fault not in HARMLESS]
-    if latched:
+    if latched := _latched(now):
         hint = "look at the specimen, then `fabctl rig clear` and `fabctl rig retract`"
         found.append(Finding("RIG-LATCHED", f"the controller still holds {', '.join(latched)}", hint=hint))
     if "unhomed" not in now.faults and now.position_mm > safe_height_mm + STANDING_MM:
         text = f"the indenter stands at {now.position_mm:.2f} mm, safe is {safe_height_mm:g} mm"
         found.append(Finding("RIG-DOWN", text, hint="look at the specimen, then `fabctl rig retract`"))
     return found
+
+
+def _latched(now: Sample) -> list[str]:
+    return [fault for fault in now.faults if fault not in HARMLESS]
 
 
 @dataclass
@@ -166,7 +170,8 @@ class Runner:
             self._do(action)
         except NoContact as fault:
             now = self.sampler.fresh()
-            if not action.point or now.faults or now.force_N - self.sampler.tare_N >= fault.trigger_N:
+            touches = now.force_N - self.sampler.tare_N >= fault.trigger_N
+            if not action.point or _latched(now) or touches:
                 raise
             self.ending.no_contact[action.point] = str(fault)
             self.emit(Event("no_contact", f"point {action.point}: {fault}", data={"point": action.point}))
@@ -189,7 +194,7 @@ class Runner:
             self.ending.curves_done.append((action.point, action.curve))
             self.emit(Event("curve", f"curve {action.curve} done", data={"point": action.point, "curve": action.curve}))
         elif action.kind == "hold":
-            self.sampler.for_a_time(action.time_s)
+            self._hold(action)
         elif action.kind == "wait":
             self._wait(action.message)
         else:
@@ -259,6 +264,26 @@ class Runner:
             self._drive(self._clear_mm, action.speed_mm_s, below_N=self.sampler.tare_N + action.force_N)
         else:
             self._drive(self.method.limits.travel_mm, action.speed_mm_s, above_N=self.sampler.tare_N + action.force_N)
+
+    def _hold(self, action: Action) -> None:
+        """Stand; where a force is to be kept, follow the creeping specimen by small steps downwards."""
+        if action.force_N is None:
+            self.sampler.for_a_time(action.time_s)
+            return
+        until_s = self.clock.now_s() + action.time_s
+        goal_N = self.sampler.tare_N + action.force_N
+        while (left_s := until_s - self.clock.now_s()) > 0:
+            lacking_N = goal_N - statistics.fmean(self.sampler.for_a_time(min(KEEP_S, left_s)))
+            if lacking_N > KEEP_FRAC * action.force_N:
+                self._follow(action, lacking_N / action.force_N, goal_N * (1 + KEEP_OVER_FRAC))
+
+    def _follow(self, action: Action, lacking_frac: float, at_most_N: float) -> None:
+        """Go deeper by what the secant stiffness says is lacking; the controller stops it above `at_most_N`."""
+        assert self.sampler.zero_mm is not None
+        here_mm = self.sampler.fresh().position_mm
+        step_mm = min(lacking_frac * max(here_mm - self.sampler.zero_mm, 0.0), KEEP_STEP_MM)
+        goal_mm = min(here_mm + step_mm, self.method.limits.travel_mm)
+        self._drive(goal_mm, action.speed_mm_s, above_N=at_most_N)
 
     def _wait(self, message: str) -> None:
         self.emit(Event("wait", message))

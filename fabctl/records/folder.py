@@ -12,6 +12,7 @@ import json
 import os
 import platform
 import secrets
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -32,12 +33,12 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Write `text` so that after a crash the file is either absent (or as before) or whole."""
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write text or bytes so that after a crash the file is either absent (or as before) or whole."""
     draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        with draft.open("w", encoding="utf-8") as stream:
-            stream.write(text)
+        with draft.open("wb") as stream:
+            stream.write(content.encode() if isinstance(content, str) else content)
             stream.flush()
             os.fsync(stream.fileno())
         draft.replace(path)
@@ -157,9 +158,13 @@ class RunFolder:
         write_atomically(self.path / "result.json", as_json(dict(result)))
 
     def finish(self, status: str, message: str = "", **details: Any) -> None:
-        """Close the run: `status` is done, stopped, failed or refused."""
+        """Close the run: `status` is done, stopped, failed or refused. An interrupt meanwhile comes afterwards."""
         body = {"status": status, "message": message, "finished_utc": _utc().isoformat(), **details}
-        write_atomically(self.path / "outcome.json", as_json(body))
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+        try:
+            write_atomically(self.path / "outcome.json", as_json(body))
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def start_run(

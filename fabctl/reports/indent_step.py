@@ -24,6 +24,7 @@ FIGURES = (
     ("hysteresis_ratio", "hysteresis", ""),
     ("recovery_ratio", "recovery of shape", ""),
 )
+HELD = (("relaxation_ratio", "relaxation", ""), ("creep_mm", "creep", "mm"))  # told only where a method holds
 
 
 def indent_step(run: RunFolder, design: Path) -> Step:
@@ -48,7 +49,7 @@ def indent_step(run: RunFolder, design: Path) -> Step:
 
 def _facts(result: Mapping[str, Any], config: Mapping[str, Any], started: datetime | None) -> list[Fact]:
     found = []
-    for key, label, unit in FIGURES:
+    for key, label, unit in (*FIGURES, *(row for row in HELD if result.get(row[0]) is not None)):
         value = result.get(key)
         if value is None:
             reason = result.get("not_found", {}).get(key)

@@ -31,6 +31,8 @@ def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
         word, sentence, reasons = coupon_verdict(latest.get("coupon"), latest.get("cut"))
     else:
         word, sentence, reasons = verdict(latest)
+    if made_up := simulated(latest):
+        sentence = f"{sentence} Simulated, on no real device: {', '.join(made_up)}."
     record = specimen.record()
     name = _design_name(specimen)
     return Report(
@@ -84,6 +86,18 @@ def verdict(latest: dict[str, RunFolder]) -> tuple[Word, str, list[str]]:
     if scan.get("verdict") == "fail":
         return "fail", f"{size}; out of tolerance.", [share]
     return "incomplete", f"{size}; the scan leaves the verdict open.", [f["message"] for f in scan.get("findings", [])]
+
+
+def simulated(latest: dict[str, RunFolder]) -> list[str]:
+    """Return the kinds whose telling run was made on a simulated bench, in the order of the work."""
+    return [kind for kind in ("cut", "indent", "scan") if kind in latest and _on_simulators(latest[kind])]
+
+
+def _on_simulators(run: RunFolder) -> bool:
+    config = run.manifest().get("config", {})
+    bench = config.get("bench")
+    listed = isinstance(bench, dict) and (bench.get("simulated") or bench.get("simulators"))
+    return bool(config.get("simulated") or listed)
 
 
 def _keys(steps: Sequence[Step], latest: dict[str, RunFolder]) -> Iterator[Fact]:

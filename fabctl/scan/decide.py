@@ -84,7 +84,8 @@ def decide_by_border(
         return mine
     others = [(edges[k], telling[k]) for k in far]
     others += [] if turns is None else [e for e in turns.edges if e[1].any()]
-    return mine if clinched(edges[first], others) else None
+    enough = all(finder.long_enough(which) for _, which in others)
+    return mine if enough and clinched(edges[first], others) else None
 
 
 def decide_by_paint(

@@ -21,6 +21,7 @@ COVER_SAMPLES = 5000
 COVER_LEAST_FRAC = 0.01  # of the diagonal; a target sample with a point this near is covered
 LONE_LIMIT = 4.0  # times the patch's own scatter: a point that far from its patch's median is a wrong match
 CROWD_RATIO = 0.15  # a patch with less than this part of the usual number of points holds only wrong matches
+PATCH_RATIO = 0.4  # of the usual number of points; a patch with fewer is the edge of a gap and has no mean
 RESAMPLES = 200
 
 
@@ -35,7 +36,7 @@ class Deviation:
     on_border: Mask  # (n,)
     lone: Mask  # (n,)
     vertex_mm: Floats  # (vertices,), the mean deviation about each vertex of the target, NaN where nothing was seen
-    patch_mm: Floats  # (patches,), means over even patches of the target, NaN where nothing was seen
+    patch_mm: Floats  # (patches,), means over even patches of the target, NaN where too little was seen
     covered_frac: float  # of the target's area
 
 
@@ -103,7 +104,7 @@ def deviate(points: Floats, pose: Similarity, target: Target) -> Deviation:
     weight = np.where(counts, 1.0 / np.maximum(number[patch], 1), 0.0)
     weight /= max(weight.sum(), 1e-300)
     patch_mean = np.full(tree.n, np.nan)
-    held = number > 0
+    held = number >= max(1.0, PATCH_RATIO * float(np.median(number[number > 0]))) if counts.any() else number > 0
     patch_mean[held] = np.bincount(patch[counts], value[counts], minlength=tree.n)[held] / number[held]
     return Deviation(
         placed,

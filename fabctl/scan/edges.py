@@ -31,6 +31,7 @@ OFFSETS = np.arange(-1.5, 0.05, 0.1)  # spacings; a scan's edges lie a little in
 PAST = 2.5  # spacings; a cloud that reaches past the border by more goes on
 STRAY_SHARE = 0.04  # of a stretch's points may be stray
 LEAST_STRETCHES, LEAST_IN_STRETCH = 12, 4
+LEAST_LENGTH = 100.0  # spacings of border that must tell two poses apart
 CLINCHED, NEXT_RATIO, CROSSED = 0.45, 0.6, 0.1
 
 
@@ -101,6 +102,10 @@ class EdgeFinder:
         loops = int(border.loop.max()) + 1
         mean = np.bincount(border.loop, away, minlength=loops) / np.bincount(border.loop, minlength=loops)
         return np.asarray((mean > 0.6 * WINDOW * self.spacing_mm)[self.loop])
+
+    def long_enough(self, which: Mask) -> bool:
+        """Return whether the stretches `which` are long against the points' spacing: else chance may fit them."""
+        return float(self.length_mm[which].sum()) > LEAST_LENGTH * self.spacing_mm
 
 
 def edge_finder(points: Floats, pose: Similarity, target: Target) -> EdgeFinder | None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from fabctl.scan.judge import Judged, judge, thin
 from fabctl.scan.paint import Paint
 from fabctl.scan.refine import Options, is_weak, moved_by, refine, weak_motions
 from fabctl.scan.rim import Rest
+from fabctl.scan.said import Status, findings_of
 from fabctl.scan.similarity import Similarity
 from fabctl.scan.symmetry import Symmetries, find_mirrors
 from fabctl.scan.target import Closest, Target
@@ -45,13 +45,11 @@ CANDIDATES = 6
 LEAST_MEMBERS = 200
 MIRROR_BETTER_RATIO = 0.7
 MIRROR_DOUBT_FRAC = 0.005
-SAME_POSE_FRAC = 0.004
+SAME_POSE_FRAC, NEAR_POSE_FRAC = 0.004, 0.06
 FINAL_ROUNDS, SETTLED_FRAC = 3, 1e-4  # of the diagonal
 PUSHES_FRAC = (-0.04, -0.015, 0.015, 0.04)
 
 NO_SYMMETRIES = Symmetries((), None, None)
-
-Status = Literal["aligned", "symmetric", "ambiguous", "failed", "mirrored"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +202,9 @@ def register(task: Task) -> Registration:
 
 def _decided(task: Task, body: Body, found: list[Judged]) -> Registration:
     """Return the answer from the distinct poses, the best first."""
+    found = _settled(task, body, found)
     best = found[0]
-    rivals = [j for j in found[1:] if j.score_frac <= RIVAL_RATIO * best.score_frac]
+    rivals = _rivals(found)
     turned = list(_symmetric(task, body, best))
     if task.datums is not None:
         chosen, single = decide_by_datums([best, *turned, *rivals], task.datums, task.target, task.symmetries)
@@ -226,6 +225,29 @@ def _decided(task: Task, body: Body, found: list[Judged]) -> Registration:
             return _finished(task, "aligned", single_out, others, body, "border")
     status: Status = "ambiguous" if rivals else "symmetric" if turns else "aligned"
     return _finished(task, status, best, (*turned, *rivals), body)
+
+
+def _rivals(found: list[Judged]) -> list[Judged]:
+    return [j for j in found[1:] if j.score_frac <= RIVAL_RATIO * found[0].score_frac]
+
+
+def _settled(task: Task, body: Body, found: list[Judged]) -> list[Judged]:
+    """Return the poses, the best first, where those that lie near the best are refined again with all the points.
+
+    A surface that slides in itself is held by its rim alone, and few points show a rim only roughly: what looks like
+    two poses may be one.
+    """
+    best = found[0]
+    near = [j for j in _rivals(found) if task.symmetries.apart_frac(best.pose, j.pose, task.target) < NEAR_POSE_FRAC]
+    if not near:
+        return found
+    rest = [j for j in found[1:] if not any(j is n for n in near)]
+    again = [refine(body.dense, j.pose, task.target, task.options) for j in (best, *near)]
+    sharper = [
+        judge(fit, body.even[:JUDGE_POINTS], body.dense, task.target, j.relation)
+        for fit, j in zip(again, (best, *near), strict=True)
+    ]
+    return _distinct(task, [*sharper, *rest])
 
 
 def _by_paint(task: Task, body: Body, candidates: list[Judged]) -> Judged | None:
@@ -289,7 +311,7 @@ def _finished(
             specimen = specimen_points(task, body.part, best.pose)
             if NO_SYMMETRIES.apart_frac(before, best.pose, task.target) < SETTLED_FRAC:
                 break
-    findings = tuple(_findings(task, status, best, alternatives))
+    findings = tuple(findings_of(status, best, alternatives, body.part, task.cleaned, task.symmetries, task.target))
     return Registration(status, best, alternatives, body.part, specimen, task.symmetries, findings, decided_by)
 
 
@@ -329,48 +351,3 @@ def _too_low(found: Closest, pose: Similarity, cleaned: Cleaned, room_cu: float 
     height = cleaned.table.height(back(found.points_mm))
     level = np.abs((found.normals @ pose.rotation) @ cleaned.table.normal)
     return np.asarray(height < cleaned.table_top_cu * (1 + 0.9 * level) + room_cu)
-
-
-def _findings(task: Task, status: Status, best: Judged, alternatives: tuple[Judged, ...]) -> Iterator[Finding]:
-    cleaned, symmetries, target = task.cleaned, task.symmetries, task.target
-    if status == "failed":
-        yield Finding(
-            "SCAN-NO-FIT",
-            f"no pose explains the cloud: the best leaves {best.score_frac:.2%} of the diagonal (rms), covers "
-            f"{best.coverage_frac:.0%} of the target and explains {best.explained_frac:.0%} of the points",
-            hint="is it the right target and cloud, and is the specimen's own cloud large enough?",
-        )
-    if status == "mirrored":
-        yield Finding(
-            "SCAN-MIRROR",
-            f"the cloud is the mirror image of the target (fits to {best.score_frac:.2%} of the diagonal): the "
-            "specimen was deployed to the other side, or cut from the mirrored pattern",
-            hint="snap it to the other side, or compare with the mirrored target",
-        )
-    if status == "ambiguous":
-        worst = max(a.score_frac for a in alternatives) / best.score_frac - 1
-        yield Finding(
-            "SCAN-AMBIGUOUS",
-            f"{len(alternatives)} other poses fit within {worst:.1%} of the best; geometry cannot decide",
-            hint="give three datum points (--datum), markers, or scan more of the specimen",
-        )
-    if status == "symmetric":
-        for line in symmetries.describe():
-            yield Finding(
-                "SCAN-SYMMETRY",
-                f"the target has a symmetry, so the pose is known only up to it: {line}",
-                level="warning",
-                hint="datum points (--datum) decide; the numbers hold for every such pose listed",
-            )
-    if status in ("aligned", "symmetric", "ambiguous") and cleaned.table is not None:
-        up = best.pose.rotation @ cleaned.table.normal
-        area = target.mesh.face_areas_mm2()
-        a, b, c = (target.mesh.vertices_mm[target.mesh.faces[:, k]] for k in range(3))
-        facing = np.cross(b - a, c - a).sum(axis=0) / (2 * area.sum())
-        if float(facing @ up) < -0.3:
-            yield Finding(
-                "SCAN-OTHER-SIDE",
-                "on its table the specimen shows its back: it lies upside down or was deployed to the other side",
-                level="warning",
-                hint="look which face is marked; for a target that is its own mirror image geometry cannot tell",
-            )

@@ -41,6 +41,7 @@ SCALE_RATIO = 0.003
 LEAST_KERF_MM = 0.03  # below this the slit is not through
 MOST_DISAGREE_MM = 0.04
 MOST_RIM_RATIO = 0.2
+MOST_MISPLACED_MM = 0.3  # of a mark's centre; half a percent of the coupon
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +79,7 @@ def measure(image: NDArray[np.uint8], source: str, coupon: Coupon, gamma: str = 
     if errors(found):
         raise RefusedError("the coupon's marks are not found", found)
     H = _coupon_to_pixels(markers, coupon.marks)
+    found += _layout_findings(H, markers, coupon.marks, source)
 
     def to_pixels(points_mm: F64) -> F64:
         return warp(H, points_mm)
@@ -147,6 +149,17 @@ def _coupon_to_pixels(markers: Sequence[Marker], sheet: MarkSheet) -> F64:
     told = np.vstack([np.vstack([mark.corners_mm, mark.centre_mm]) for _, mark in pairs])
     seen = np.vstack([np.vstack([marker.corners_px, marker.centre_px]) for marker, _ in pairs])
     return homography(told, seen)
+
+
+def _layout_findings(H: F64, markers: Sequence[Marker], sheet: MarkSheet, source: str) -> list[Finding]:
+    """Return an error where the marks do not lie as the coupon's: it is another one, or the picture is bent."""
+    pairs = [(marker, mark) for marker in markers if (mark := sheet.mark(marker.id)) is not None]
+    seen = warp(np.asarray(np.linalg.inv(H), dtype=np.float64), np.array([marker.centre_px for marker, _ in pairs]))
+    off_mm = float(np.linalg.norm(seen - np.array([mark.centre_mm for _, mark in pairs]), axis=1).max())
+    if off_mm <= MOST_MISPLACED_MM:
+        return []
+    text = f"a mark lies {off_mm:.2f} mm from where this coupon has it, {MOST_MISPLACED_MM:g} mm is the limit"
+    return [Finding("KERF-COUPON", text, where=source, hint="the coupon.json of this coupon? lying flat?")]
 
 
 def _mm_per_px(H: F64, coupon: Coupon) -> float:

@@ -100,7 +100,8 @@ def find_board(image: NDArray[np.uint8], board: Charuco, source: str) -> tuple[B
     seen = set() if marker_ids is None else {int(k) for k in np.ravel(marker_ids)}
     count = 0 if ids is None else len(ids)
     strange = seen - {int(k) for k in board.ids}
-    if len(strange) > len(seen) / 4 and len(strange) >= 3:
+    # Marks of the bed around the board are strange too, and do no harm.
+    if len(strange) > len(seen) - len(strange) and len(strange) >= 3:
         hint = "give the board file of the board in the picture"
         return None, [
             Finding(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from design.pattern.paths import CutPath
+from fabctl.records.folder import write_atomically
 from fabctl.vision.align import Alignment
 from fabctl.vision.inspect import Inspection
 from fabctl.vision.lens import COVERAGE_CELLS, BoardView, covered_cells
@@ -171,9 +172,9 @@ def _whole(point: F64) -> tuple[int, int]:
 
 
 def write_picture(path: str, picture: Picture) -> None:
-    """Write a picture; raise `OSError` where it cannot be written."""
+    """Write a picture; raise `RecordError` where it cannot be written."""
     import cv2
 
     good, data = cv2.imencode(Path(path).suffix, picture)
     assert good, f"{path}: a picture of shape {picture.shape} does not become bytes"
-    Path(path).write_bytes(data.tobytes())
+    write_atomically(Path(path), data.tobytes())

@@ -17,6 +17,7 @@ from typing import Any
 
 from simulators.rig.controller import APEX, Controller, Machine
 from simulators.rig.faults import ENDINGS, KINDS, FaultyLine
+from simulators.rig.grams import Grams
 from simulators.rig.server import Pace, Server
 from simulators.specimens.analytic import BY_NAME
 from simulators.specimens.curve import Curves, Place, Specimen
@@ -24,6 +25,7 @@ from simulators.specimens.relief import ReliefError, read_relief
 from simulators.specimens.slot import SlotError, read_mass_kg, read_response
 
 GRAVITY_N_KG = 9.80665
+MAKERS: dict[str, type[Controller]] = {"reference": Controller, "grams": Grams}
 
 
 class Truth:
@@ -134,6 +136,7 @@ def parse(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--specimen", choices=sorted(BY_NAME), help="what lies there while the slot is empty")
     parser.add_argument("--unit", type=int, default=1)
+    parser.add_argument("--registers", choices=sorted(MAKERS), default="reference", help="whose register map")
     parser.add_argument("--baud", type=int, default=115200, help="pace of the serial line; 0: as fast as it goes")
     parser.add_argument("--turnaround-ms", type=float, default=1.0)
     parser.add_argument("--noise-N", type=float, default=3e-4, help="of one conversion, a thousand a second")
@@ -189,7 +192,7 @@ def main(words: list[str]) -> int:
     options = parse(words)
     hurry()
     truth = Truth(options.truth)
-    device = Controller(drawn(options), seed=options.seed)
+    device = MAKERS[options.registers](drawn(options), seed=options.seed)
     device.tell = lambda kind, facts: truth.event(device.tick_count, kind, facts)
     slot = Slot(options.slot, options, truth)
     device.on_arm = slot.look

@@ -50,3 +50,21 @@ def test_every_command_a_page_names_exists(name: str) -> None:
     named = [part.split("`")[0].split()[1:3] for part in text.split("`")[1::2] if part.startswith("fabctl ")]
     for words in named:
         assert words[0] in nouns | {"--help"}, f"{name} names fabctl {' '.join(words)}"
+
+
+def test_every_number_on_the_command_line_has_two_ends() -> None:
+    ranges = click.FloatRange | click.IntRange
+    numbers = [
+        (path, param.opts[-1], param.type)
+        for path, found in every_command()
+        for param in found.params
+        for kind in (param.type.types if isinstance(param.type, click.Tuple) else [param.type])
+        if isinstance(kind, click.types.FloatParamType | click.types.IntParamType)
+    ]
+    assert len(numbers) > 40
+    assert [n for n in numbers if not isinstance(n[2], ranges) or n[2].min is None or n[2].max is None] == []
+
+
+def test_every_option_says_what_it_is() -> None:
+    options = [(path, p) for path, found in every_command() for p in found.params if isinstance(p, click.Option)]
+    assert [(path, p.opts[-1]) for path, p in options if not p.help] == []

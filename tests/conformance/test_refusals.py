@@ -17,6 +17,7 @@ from drivers.errors import DeviceAlarm, DeviceTimeout, TransportError
 from fabctl.cli.common import run_guarded, show
 from fabctl.cli.main import cli
 from fabctl.errors import BUG, DEVICE, OPERATOR, OUT_OF_TOLERANCE, REFUSED, USAGE, ConfigError, RefusedError, Stopped
+from fabctl.flow import StepFailed
 
 KEYS = {"code", "level", "where", "what", "value", "unit", "limit", "remedy"}
 
@@ -101,6 +102,11 @@ FAULTS: list[tuple[BaseException, int, dict[str, Any]]] = [
     (DeviceTimeout("rig", "a sample", 0.5), DEVICE, {"code": "DEVICE-TIMEOUT", "value": 0.5, "unit": "s"}),
     (DeviceAlarm("laser", 9, "homing failed"), DEVICE, {"code": "DEVICE-ALARM", "value": 9}),
     (Stopped("by the operator"), OPERATOR, {"code": "STOPPED"}),
+    (
+        StepFailed("indent", REFUSED, "try again", [Finding("RIG-DOWN", "it is low", "error", "", "", 8.4, "mm", 1.0)]),
+        REFUSED,
+        {"code": "RIG-DOWN", "value": 8.4, "unit": "mm", "limit": 1.0},
+    ),
     (KeyboardInterrupt(), OPERATOR, {"code": "STOPPED"}),
     (click.exceptions.Abort(), OPERATOR, {"code": "STOPPED"}),
     (ZeroDivisionError("division by zero"), BUG, {"code": "BUG"}),
@@ -147,9 +153,11 @@ def test_an_answer_that_is_a_no_has_the_same_shape(
 
     monkeypatch.setattr(sys, "argv", ["fabctl", "--json"])
     assert run_guarded(command) == OUT_OF_TOLERANCE
-    body = json.loads(capsys.readouterr().out)
+    said = capsys.readouterr()
+    body = json.loads(said.out)
     assert_refused(body, OUT_OF_TOLERANCE)
     assert body["slits_count"] == 3
+    assert said.err == "fabctl: not as designed\n  error CUT-MISSING: 3 slits are not cut\n"
 
 
 def test_a_no_without_findings_of_its_own_is_one(

@@ -16,6 +16,7 @@ from design.errors import DesignError
 from design.pattern.paths import LAYERS, LayerPreset
 from design.pattern.slits import HingeOptions
 from design.pipeline import Design, build
+from design.predicted import _doubts
 from design.spec import DesignSpec
 from design.targets import cap
 
@@ -83,3 +84,15 @@ def test_a_narrower_hinge_leaves_no_cell_called_monostable_that_it_would_hold_op
     for k in some.tolist():
         cell = solve_cell(narrow.table["t_mm"][k], narrow.table["theta_rad"][k], replace(Sheet(), hinge_mm=0.2))
         assert cell.verdict != "bistable"
+
+
+@pytest.mark.parametrize(("width", "level"), [(0.25, None), (0.28, "info"), (0.36, "warning")])
+def test_a_prediction_says_that_bending_is_not_that_of_its_hinge(width: float, level: str | None) -> None:
+    doubts = [finding for finding in _doubts(with_hinge(load_library(), width)) if finding.code == "DEPLOY-HINGE"]
+    assert [finding.level for finding in doubts] == ([level] if level else [])
+
+
+def test_a_design_says_which_expansions_its_hinges_leave() -> None:
+    told = {finding.code: finding.message for finding in made(HingeOptions("constant", 0.36)).findings}
+    assert "with the library's 0.25 mm from" in told["HINGE-RANGE"]
+    assert "HINGE-RANGE" not in {finding.code for finding in made(HingeOptions()).findings}

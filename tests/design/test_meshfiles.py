@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -210,3 +211,18 @@ def test_an_odd_line_is_not_passed_over(odd: str) -> None:
     soup = parse_obj("\n".join(lines).encode())
     assert isinstance(soup.polygons, list)
     assert [finding.code for finding in soup.findings] == (["FILE-LINE"] if odd in ("v 1 2", "f 1 2 x") else [])
+
+
+def test_a_mesh_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.obj").write_text("as before")
+
+    def fill_the_disk(path: Path, text: str) -> None:
+        path.write_bytes(text[:100].encode())
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", fill_the_disk)
+    with pytest.raises(OSError, match=r"a\.obj"):
+        write_mesh(tmp_path / "a.obj", CAP)
+    monkeypatch.undo()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.obj"]
+    assert (tmp_path / "a.obj").read_text() == "as before"

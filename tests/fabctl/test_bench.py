@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import textwrap
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fabctl.bench import announced, open_bench
+from fabctl.bench import HELD, announced, open_bench
 from fabctl.config.bench import BenchConfig, load_bench
 from fabctl.config.loader import parse
 from fabctl.errors import BenchBusy, ConfigError, UsageError
@@ -17,6 +18,8 @@ from fabctl.simulated import SimulatorError, alive, start, stop
 from fabctl.workspace import Workspace
 
 ECHO = "python -c \"print('ready tcp://127.0.0.1:7', flush=True); import time; time.sleep(60)\""
+
+TEXT = "name: toy\nlaser: {url: 'ready:laser', travel_mm: [300, 200]}\n"
 
 
 def config(simulators: str = "{}", url: str = "ready:laser") -> BenchConfig:
@@ -101,3 +104,32 @@ def test_a_simulator_that_is_not_up_names_the_command(tmp_path: Path) -> None:
 def test_a_damaged_list_of_simulators_is_no_list(tmp_path: Path, text: str) -> None:
     (tmp_path / "simulators.json").write_text(text)
     assert announced(tmp_path) == {}
+
+
+def run_step(*words: str, handle: int | None = None) -> int:
+    """Try to hold the bench in a process of its own, as a flow's step with `handle`; return its exit code."""
+    script = textwrap.dedent(f"""
+        from pathlib import Path
+        from fabctl.bench import open_bench
+        from fabctl.config.loader import parse
+        from fabctl.config.bench import BenchConfig
+        from fabctl.workspace import Workspace
+        with open_bench(Workspace(Path({words[0]!r})), parse({TEXT!r}, BenchConfig, "x"), "a step"):
+            pass
+    """)
+    given = {} if handle is None else {HELD: str(handle)}
+    fds = () if handle is None else (handle,)
+    return subprocess.run(
+        [sys.executable, "-c", script], env={**os.environ, **given}, pass_fds=fds, capture_output=True
+    ).returncode
+
+
+def test_a_flow_lends_its_bench_to_its_steps_and_to_nobody_else(tmp_path: Path) -> None:
+    bench = parse(TEXT, BenchConfig, "x")
+    with open_bench(Workspace(tmp_path), bench, "flow cap") as held:
+        assert run_step(str(tmp_path), handle=held.lock) == 0
+        assert run_step(str(tmp_path)) != 0, "another job cannot slip in between two steps"
+        with (tmp_path / "other").open("w") as other:
+            assert run_step(str(tmp_path), handle=other.fileno()) != 0, "the number of another file opens nothing"
+        assert run_step(str(tmp_path), handle=held.lock) == 0, "a step's end does not let go of the flow's lock"
+    assert run_step(str(tmp_path)) == 0

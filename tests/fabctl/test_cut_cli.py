@@ -150,16 +150,26 @@ def test_an_edited_design_is_refused(lab: Lab, tmp_path: Path) -> None:
 
 
 def test_dangerous_material_is_refused_with_everything_else_at_once(lab: Lab, tmp_path: Path) -> None:
-    code, _, err = lab.run(*lab.cut(make_design(tmp_path / "design"), "--material", "neoprene-2.0"))
+    code, out, err = lab.run(*lab.cut(make_design(tmp_path / "design"), "--material", "neoprene-2.0"))
     assert code == 3
     assert "CUT-MATERIAL-DANGER" in err
     assert "CUT-SHEET" in err
+    told = {finding["code"]: finding for finding in json.loads(out)["findings"]}
+    assert told["CUT-SHEET"].keys() >= {"what", "value", "unit", "limit", "remedy"}
+    outcome = json.loads((lab.only_run() / "outcome.json").read_text())
+    assert outcome["status"] == "refused"
+    assert {finding["code"] for finding in outcome["findings"]} == set(told)
+    assert json.loads((lab.only_run() / "manifest.json").read_text())["specimen"] is None
 
 
 def test_without_a_yes_nothing_moves(lab: Lab, tmp_path: Path) -> None:
     words = [word for word in lab.cut(make_design(tmp_path / "design")) if word != "--yes"]
-    code, _, _ = lab.run(*words)
+    code, out, err = lab.run(*words)
     assert code == 5
+    assert json.loads(out)["exit_code"] == 5
+    assert "keys:" not in err, "there is no keyboard here"
+    assert json.loads((lab.only_run() / "outcome.json").read_text())["status"] == "stopped"
+    assert not Workspace(tmp_path).specimens.exists()
     assert len(lab.beam()) <= 1
 
 

@@ -84,3 +84,19 @@ def test_the_verdict_follows_the_scan(lab: Workspace, specimen: Specimen, change
 def test_text_from_outside_cannot_become_markup(lab: Workspace, specimen: Specimen) -> None:
     run(lab, "cut", "failed", {}, "<script>alert(1)</script>")
     assert "<script>alert" not in render(specimen_report(lab, specimen))
+
+
+def test_the_verdict_says_what_was_done_on_simulators(lab: Workspace, specimen: Specimen) -> None:
+    made = {"cut": {"bench": {"simulated": True}}, "indent": {"simulated": True}, "scan": {"simulated": False}}
+    for kind, config in made.items():
+        start_run(lab.runs, kind, specimen="S-0001", config=config).finish("done")
+    report = specimen_report(lab, specimen)
+    assert report.sentence.endswith("Simulated, on no real device: cut, indent.")
+    assert "Simulated, on no real device" in render(report)
+
+
+def test_a_real_bench_is_not_called_simulated(lab: Workspace, specimen: Specimen) -> None:
+    start_run(lab.runs, "cut", specimen="S-0001", config={"bench": {"simulated": False, "simulators": {}}}).finish(
+        "done"
+    )
+    assert "imulated" not in specimen_report(lab, specimen).sentence

@@ -78,7 +78,8 @@ def tested(bench: SimulatedBench) -> dict[str, object]:
         "200",
     )
     bench.fabctl("rig", "calibrate", "frame", "--bench", "bench.yaml", "--yes", "--force-N", "4")
-    return bench.fabctl("indent", "run", "S-0001", "--method", "short.yaml", "--bench", "bench.yaml", "--yes")
+    words = ("indent", "run", "S-0001", "--method", "short.yaml", "--bench", "bench.yaml", "--yes")
+    return bench.fabctl(*words, "--batch", "B7", "--rest-h", "24")
 
 
 def test_gain_and_frame_are_calibrated_to_their_true_values(bench: SimulatedBench, tested: dict[str, object]) -> None:
@@ -100,6 +101,9 @@ def test_the_run_keeps_method_calibration_and_conditions(bench: SimulatedBench, 
     assert config["method"]["name"] == "short"
     assert config["calibration"]["gain_ratio"] == pytest.approx(1.02, abs=2e-3)
     assert config["conditions"]["temperature_degC"] == pytest.approx(22.5)
+    assert (config["conditions"]["batch"], config["conditions"]["rest_h"]) == ("B7", 24.0)
+    (told,) = [f for f in config["findings"] if f["code"] == "INDENT-CONDITIONS"]
+    assert told["message"] == "not recorded: thickness_mm"
     assert config["rig"]["firmware"] == "1.04"
 
 

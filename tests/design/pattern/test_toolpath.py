@@ -8,6 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks._travel_bound import bound_mm
 from design.errors import DesignError
 from design.pattern.order import floor_mm, greedy_with_flips, tour, travel_mm
 from design.pattern.paths import CutPath
@@ -164,11 +165,28 @@ def test_the_tour_is_the_shortest_of_all_on_a_few_strokes() -> None:
     assert length(tour(ends).tolist()) == pytest.approx(min(map(length, everything)))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_no_order_travels_less_than_the_bound(seed: int) -> None:
+    ends = np.random.default_rng(seed).uniform(0, 50, (400, 2))
+    found = travel_mm(ends, tour(ends))
+    bound = bound_mm(ends, found)
+    assert floor_mm(ends) < bound <= found
+    assert bound > 0.85 * found  # the floor is at 0.8
+
+
 def test_travel_is_a_quarter_shorter_than_greedy() -> None:
     ends = random_ends(3000, 1)
     ratio = travel_mm(ends, tour(ends)) / travel_mm(ends, greedy_with_flips(ends))
     assert ratio <= 0.75
     assert travel_mm(ends, tour(ends)) >= floor_mm(ends)
+
+
+def test_rings_that_an_exchange_closes_are_opened_again_where_that_pays() -> None:
+    rng = np.random.default_rng(2)
+    start, angle = rng.uniform(0, 105, (2000, 2)), rng.uniform(0, 2 * np.pi, 2000)
+    ends = np.stack([start, start + np.column_stack([np.cos(angle), np.sin(angle)])], axis=1).reshape(-1, 2)
+    ratio = travel_mm(ends, tour(ends, kicks_count=0)) / travel_mm(ends, greedy_with_flips(ends))
+    assert ratio <= 0.76  # 0.771 by exchanges that close no ring
 
 
 def test_layers_come_in_order_and_the_inner_contour_before_the_outer() -> None:

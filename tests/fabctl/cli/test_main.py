@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -102,3 +103,57 @@ def test_a_second_interrupt_on_the_way_out_changes_no_exit_code(name: str, early
     )
     assert done.returncode == OPERATOR, done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_terminal_without_greek_letters_ends_no_command() -> None:
+    script = (
+        "import sys, click; from fabctl.cli import main; sys.argv = ['fabctl']\n"
+        "main.cli = click.Command('x', callback=lambda: click.echo('θ')); main.main()"
+    )
+    line = [sys.executable, "-c", script]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "latin-1"})
+    assert done.returncode == DONE, done.stderr
+    assert done.stdout == b"\\u03b8\n"
+
+
+def test_a_full_disk_behind_stdout_is_the_disks_fault() -> None:
+    with Path("/dev/full").open("w") as full:
+        line = [sys.executable, "-m", "fabctl", "target", "list", "--json"]
+        done = subprocess.run(line, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == DEVICE
+    assert "no space left" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+CLOSING = """
+import os, pathlib, signal, sys, time, click
+from fabctl.cli import common
+from fabctl.records.folder import start_run
+
+@click.command()
+@click.argument("runs")
+def command(runs):
+    run = start_run(pathlib.Path(runs), "scan")
+    try:
+        print("begun", flush=True)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        os.kill(os.getpid(), signal.SIGTERM)  # the group's, and then the flow's
+        time.sleep(0.05)
+        run.finish("stopped", "stopped by the operator")
+        raise
+
+sys.exit(common.run_to_the_end(command))
+"""
+
+
+def test_signals_that_come_together_leave_a_record_of_how_the_run_ended(tmp_path: Path) -> None:
+    line = [sys.executable, "-c", CLOSING, str(tmp_path / "runs")]
+    process = subprocess.Popen(line, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begun\n"
+    process.terminate()
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == OPERATOR, err
+    (run,) = (tmp_path / "runs").iterdir()
+    assert '"stopped"' in (run / "outcome.json").read_text()

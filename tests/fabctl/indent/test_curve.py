@@ -5,13 +5,20 @@ from __future__ import annotations
 import math
 import statistics
 
+import numpy as np
 import pytest
 
-from benchmarks._rig_memory import method, press
-from fabctl.indent.curve import CurveResult
-from simulators.rig.controller import Machine
+from benchmarks._rig_memory import REGISTERS, Kept, MemoryBus, method, press
+from drivers.rig.indenter import Indenter
+from fabctl.config.loader import parse
+from fabctl.config.method import MethodConfig
+from fabctl.indent.analysis import analyse
+from fabctl.indent.curve import CurveResult, Strokes, analyse_curve
+from fabctl.indent.method import actions
+from fabctl.indent.run import Runner
+from simulators.rig.controller import Controller, Machine
 from simulators.specimens.analytic import bistable, hertz, linear, softening, tabulate
-from simulators.specimens.curve import Curves
+from simulators.specimens.curve import Curves, Specimen
 
 MACHINE = Machine(noise_N=0.005, contact_mm=2.0, parked_mm=0.2, compliance_mm_N=0.2, backlash_mm=0.0, drift_N_s=1e-4)
 
@@ -67,6 +74,87 @@ def test_a_curve_without_maximum_says_so() -> None:
 def test_hysteresis_is_the_share_of_the_work_that_is_kept() -> None:
     found = result(tabulate(lambda d: 0.5 * d, unload_ratio=0.85), 4.0)
     assert found.hysteresis_ratio == pytest.approx(0.15, abs=0.02)
+
+
+PRELOADED = """
+name: preloaded
+safe_height_mm: 0.2
+travel_speed_mm_s: 20
+limits: {force_N: 20, travel_mm: 40}
+steps:
+  - {step: tare, time_s: 0.5}
+  - {step: approach, speed_mm_s: 3, trigger_N: 0.1, clearance_mm: 1}
+  - {step: preload, force_N: 0.3, speed_mm_s: 0.5}
+  - {step: zero}
+  - {step: load, depth_mm: 3, speed_mm_s: 1}
+  - {step: unload, speed_mm_s: 3}
+  - {step: load, depth_mm: 3, speed_mm_s: 1}
+  - {step: unload, speed_mm_s: 3}
+"""
+
+
+def test_a_curve_that_begins_under_a_preload_counts_from_the_methods_zero() -> None:
+    plan = parse(PRELOADED, MethodConfig, "preloaded.yaml")
+    under, free = (numbered.result for numbered in press(linear(0.5), MACHINE, plan, 1)[0])
+    assert under.contact.kind == "zero"
+    assert under.contact.start_N == pytest.approx(0.3, abs=0.05)
+    assert under.contact.position_mm == pytest.approx(2.0 + 0.3 / 0.5, abs=0.1)
+    assert under.stiffness_secant_N_mm is not None
+    assert under.stiffness_secant_N_mm.value == pytest.approx(0.5, rel=0.02)
+    assert "under a preload" in under.reasons["stiffness_initial_N_mm"]
+    # The second begins at the clearance, free: its contact can be seen and is taken.
+    assert free.contact.position_mm == pytest.approx(2.0, abs=0.03)
+
+
+HELD = """
+name: held
+safe_height_mm: 0.2
+travel_speed_mm_s: 20
+limits: {force_N: 20, travel_mm: 40}
+steps:
+  - {step: tare, time_s: 0.5}
+  - {step: approach, speed_mm_s: 3, trigger_N: 0.1, clearance_mm: 1}
+  - {step: load, WHERE, speed_mm_s: 2}
+  - {step: hold, time_s: 20HOW}
+  - {step: unload, speed_mm_s: 3}
+  - {step: hold, time_s: 2}
+"""
+
+
+def held(where: str, how: str) -> CurveResult:
+    """Press a spring of 0.5 N/mm, a fifth of whose force relaxes with 4 s, as a test on the simulated rig would."""
+    device = Controller(MACHINE, Specimen(linear(0.5), creep_ratio=0.2, creep_s=4.0))
+    bus, kept = MemoryBus(device), Kept()
+    plan = parse(HELD.replace("WHERE", where).replace("HOW", how), MethodConfig, "held.yaml")
+    Runner(Indenter(bus, REGISTERS, now_s=bus.now_s, sleep=bus.sleep), plan, actions(plan), kept, bus, 100.0).execute()
+    return analyse(kept.samples(), MACHINE.compliance_mm_N, 2.0)[0].result
+
+
+def test_at_a_held_depth_the_force_relaxes_by_its_share() -> None:
+    found = held("depth_mm: 3", "")
+    assert found.relaxation_ratio == pytest.approx(0.2 * 0.8, abs=0.03)  # some is gone while it loads
+    assert found.creep_mm is None
+    assert "stood" in found.reasons["creep_mm"]
+
+
+def test_a_held_force_is_kept_and_the_specimen_creeps() -> None:
+    found = held("force_N: 1", ", force_N: 1")
+    assert found.relaxation_ratio is None
+    # In the end 0.8 · 0.5 N/mm · d = 1 N, at the beginning it was about 0.5 N/mm · d = 1 N with some of it gone.
+    assert found.depth_max_mm is not None
+    assert found.creep_mm is not None
+    assert found.depth_max_mm + found.creep_mm == pytest.approx(2.5, abs=0.06)
+    assert found.creep_ratio == pytest.approx(0.2, abs=0.06)
+    assert found.force_max_N is not None
+    assert found.force_max_N < 1.1
+
+
+def test_nothing_under_the_indenter_stays_not_found_for_all_a_zero_step() -> None:
+    position = np.arange(0.0, 4.0, 0.01)
+    force = np.random.default_rng(1).normal(0, 0.005, len(position))
+    found = analyse_curve(Strokes(position, force, position[::-1], force, zero_position_mm=0.5, zero_N=0.004))
+    assert found.contact.position_mm is None
+    assert "never leaves the noise" in found.contact.reason
 
 
 def test_snap_through_and_snap_back_are_jumps_of_the_force() -> None:

@@ -27,7 +27,7 @@ def codes(found: MethodConfig, predicted: Predicted | None = None, has_stage: bo
     return {finding.code for finding in check(actions(found), found, RIG, predicted, has_stage)}
 
 
-@pytest.mark.parametrize("name", ["dome", "quick", "grid", "creep", "cap"])
+@pytest.mark.parametrize("name", ["dome", "quick", "grid", "creep", "relaxation", "cap"])
 def test_the_shipped_methods_pass_their_own_check(name: str) -> None:
     found = load_method(name, NOWHERE)
     assert codes(found) == {"METHOD-NO-PREDICTION"}
@@ -71,9 +71,46 @@ def test_an_approach_without_a_tare_is_refused() -> None:
     assert "METHOD-TARE" in codes(method("  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"))
 
 
+def test_a_preload_without_a_zero_after_it_is_told() -> None:
+    begin = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"
+    preload = "  - {step: preload, force_N: 0.2, speed_mm_s: 1}\n"
+    load = "  - {step: load, depth_mm: 2, speed_mm_s: 1}\n"
+    assert "METHOD-PRELOAD" in codes(method(begin + preload + load))
+    assert "METHOD-PRELOAD" not in codes(method(begin + preload + "  - {step: zero}\n" + load))
+
+
+def test_a_tare_while_the_specimen_is_pressed_is_refused() -> None:
+    begin = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"
+    load, tare = "  - {step: load, depth_mm: 2, speed_mm_s: 1}\n", "  - {step: tare}\n"
+    for way_out, refused in (("", True), ("force_N: 0.1, ", True), (None, False)):
+        unload = "" if way_out == "" else f"  - {{step: unload, {way_out or ''}speed_mm_s: 1}}\n"
+        assert ("METHOD-TARE-PRESSED" in codes(method(begin + load + unload + tare))) == refused
+
+
+def test_a_rest_after_the_way_out_belongs_to_no_curve() -> None:
+    found = actions(load_method("relaxation", NOWHERE))
+    assert [(a.time_s, a.curve) for a in found if a.kind == "hold"] == [(60.0, 1), (10.0, 0)]
+
+
+def test_a_force_cannot_be_held_where_nothing_is_pressed() -> None:
+    begin = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"
+    hold = "  - {step: hold, time_s: 5, force_N: 0.5}\n"
+    assert "METHOD-HOLD" in codes(method(begin + hold))
+    assert "METHOD-HOLD" not in codes(method(begin + "  - {step: load, force_N: 0.5, speed_mm_s: 1}\n" + hold))
+
+
 def test_a_predicted_force_above_the_limit_is_refused() -> None:
     stiff = Predicted(np.linspace(0, 10, 11), np.linspace(0, 20, 11))
     assert "METHOD-PREDICTED-FORCE" in codes(load_method("dome", NOWHERE), stiff)
+
+
+def test_a_force_that_the_specimen_is_predicted_never_to_reach_is_told() -> None:
+    soft = Predicted(np.linspace(0, 10, 11), np.linspace(0, 0.02, 11))
+    assert "METHOD-OUT-OF-REACH" not in codes(load_method("creep", NOWHERE), soft)
+    softer = Predicted(np.linspace(0, 10, 11), np.linspace(0, 0.01, 11))
+    plan = load_method("creep", NOWHERE)
+    told = [f.message for f in check(actions(plan), plan, RIG, softer) if f.code == "METHOD-OUT-OF-REACH"]
+    assert [text.split(":")[0] for text in told] == ["hold to 0.012 N", "load to 0.012 N"]
 
 
 def test_a_snap_in_the_prediction_counts_with_its_peak() -> None:

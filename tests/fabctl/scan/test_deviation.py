@@ -44,3 +44,13 @@ def test_every_area_weighs_the_same_however_many_points_it_caught(freeform_targe
     crowded = np.concatenate([shifted, shifted[right], shifted[right], shifted[right]])
     numbers = statistics(deviate(crowded, IDENTITY, freeform_target), freeform_target)
     assert abs(numbers.mean_mm) < 0.03
+
+
+def test_a_few_points_at_the_edge_of_a_gap_are_no_patch(freeform_target: Target) -> None:
+    points, normals, _ = freeform_target.even_samples(40_000)
+    middle = points[0]
+    away = np.linalg.norm(points - middle, axis=1) / freeform_target.diagonal_mm
+    few = np.argsort(away)[:6]
+    scanned = np.concatenate([points[away > 0.1], points[few] + 1.5 * normals[few]])
+    numbers = statistics(deviate(scanned, IDENTITY, freeform_target), freeform_target)
+    assert abs(numbers.max_patch_mm) < 0.05

@@ -9,6 +9,8 @@ from design.targets import vase
 from fabctl.scan.clean import clean
 from fabctl.scan.decide import Datums
 from fabctl.scan.register import Registration, Task, register
+from fabctl.scan.said import left_aside
+from fabctl.scan.similarity import Similarity
 from fabctl.scan.symmetry import find_symmetries
 from fabctl.scan.target import Target
 from simulators.photogrammetry import ScanPlan
@@ -68,3 +70,23 @@ def test_an_unrelated_cloud_is_refused() -> None:
     made = scanned("cap", RAW)
     found = register(Task(made.points, clean(made.points), TARGETS["freeform"], symmetries_of("freeform")))
     assert found.status == "failed"
+
+
+def test_coordinates_far_from_the_origin_change_nothing() -> None:
+    made = scanned("freeform", RAW)
+    size = made.scale_ratio
+    points = made.points / size + np.array([4.5e5, 5.2e6, 300.0])
+    found = register(Task(points, clean(points, 3), TARGETS["freeform"], symmetries_of("freeform"), 1.0, seed=3))
+    assert found.status == "aligned"
+    assert found.best is not None
+    moved = Similarity(np.eye(3), np.array([4.5e5, 5.2e6, 300.0]), 1 / size)
+    off = symmetries_of("freeform").apart_frac(true_pose(made), found.best.pose.after(moved), TARGETS["freeform"])
+    assert off < 0.0005
+
+
+def test_another_thing_of_the_specimens_size_is_told() -> None:
+    points = TARGETS["cap"].even_samples(8000)[0]
+    small = 0.3 * points + np.array([0.0, 300.0, 0.0])
+    for other, said in ((points + np.array([250.0, 0.0, 0.0]), ["SCAN-OTHERS"]), (small, [])):
+        cleaned = clean(np.concatenate([points, other]))
+        assert [f.code for f in left_aside(cleaned, cleaned.parts[0])] == said

@@ -59,6 +59,21 @@ def test_boards_of_other_sizes_and_old_programs_are_found_corner_by_corner(
         assert find_board(picture, replace(board, legacy=False), "picture")[0] is None
 
 
+def test_a_board_held_over_the_marks_of_the_bed_is_found_among_them() -> None:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
+    board = boards.Charuco("lens", 7, 5, 20.0, 15.0)
+    drawn = cv2.aruco.CharucoBoard((7, 5), 20.0, 15.0, dictionary, board.ids)
+    picture = np.full((700, 1000), 180, np.uint8)
+    picture[150:550, 200:760] = drawn.generateImage((560, 400)) // 2 + 60
+    for k in range(12):
+        row, column = (20, 80 * k + 20) if k < 6 else (620, 80 * k - 440)
+        picture[row : row + 56, column : column + 56] = cv2.aruco.generateImageMarker(dictionary, k, 56) // 2 + 50
+    view, found = find_board(picture, board, "picture")
+    assert not found
+    assert view is not None
+    assert len(view.corners_px) == 24
+
+
 def test_a_mark_that_is_turned_keeps_its_centre_and_its_first_corner() -> None:
     mark = boards.Mark(1, 10.0, 20.0, 8.0, math.pi / 2)
     assert mark.corners_mm.mean(axis=0) == pytest.approx([10, 20])

@@ -198,3 +198,6 @@ def test_specimens_are_listed_noted_and_known_by_their_engraved_id(fabctl: Fabct
     cv2.imwrite("blank.png", cv2.resize(np.tile(np.array([[40, 200]], np.uint8), (60, 60)), (240, 240)))
     with pytest.raises(RefusedError, match="no specimen id"):
         fabctl("specimen", "read", "blank.png")
+    cv2.imwrite("mirror.png", page[:, ::-1])
+    with pytest.raises(RefusedError, match=f"{name} is seen in a mirror"):
+        fabctl("specimen", "read", "mirror.png")

@@ -100,6 +100,12 @@ def test_a_picture_without_the_coupon_or_with_it_far_away_is_refused(picture: ND
         measure(picture[::2, ::2].copy(), "far", COUPON)
 
 
+def test_the_file_of_another_coupon_is_refused_by_its_marks() -> None:
+    other = coupons.make_coupon([0.5, 0.6, 0.7], FEED_mm_s)
+    with pytest.raises(RefusedError, match="KERF-COUPON"):
+        measure(photograph_coupon(over_light=True), "photo", other)
+
+
 def test_the_coupons_program_cuts_every_slit_at_its_power() -> None:
     lines = coupons.coupon_gcode(COUPON, LayerPreset(0.12, 60.0), 0.1, GcodeOptions())
     assert lines.count("M4S0") == 1

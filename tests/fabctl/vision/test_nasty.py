@@ -108,7 +108,8 @@ def cropped(picture: Picture) -> bytes:
 @pytest.mark.parametrize(
     ("make", "ended", "said"),
     [
-        (lambda _: b"", USAGE, "not a picture"),
+        (lambda _: b"", USAGE, "is empty"),
+        (lambda _: b"words", USAGE, "not a picture"),
         (lambda _: b"\x00\x00\x00\x18ftypheic\x00\x00\x00\x00heic" + bytes(4000), USAGE, "export others (HEIC"),
         (lambda p: encoded(p, ".jpg")[:30000], USAGE, "ends in the middle"),
         (lambda p: encoded(p)[:60000], USAGE, "ends in the middle"),
@@ -119,7 +120,19 @@ def cropped(picture: Picture) -> bytes:
         (two_beds, REFUSED, "MARKS-TWICE"),
         (cropped, REFUSED, "MARKS-"),
     ],
-    ids=["nothing", "HEIC", "torn JPEG", "torn PNG", "float", "mirror", "larger", "portrait", "two beds", "cropped"],
+    ids=[
+        "nothing",
+        "words",
+        "HEIC",
+        "torn JPEG",
+        "torn PNG",
+        "float",
+        "mirror",
+        "larger",
+        "portrait",
+        "two beds",
+        "cropped",
+    ],
 )
 def test_what_cannot_be_aligned_by_is_refused_by_name(
     make: Callable[[Picture], bytes],

@@ -1,0 +1,121 @@
+"""The operator's side of the rig: by hand, Ctrl-C, a killed host, and going on afterwards."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fabctl.records.folder import RunFolder, open_run, status_of
+from fabctl.testing import SimulatedBench
+from fabctl.workspace import Workspace
+from tests.rig_endpoints import ROOT, simulated_rig
+
+METHOD = """name: short
+sample_hz: 100
+safe_height_mm: 0.5
+travel_speed_mm_s: 20
+acceleration_mm_s2: 200
+limits: {force_N: 4, tension_N: 1, travel_mm: 40, watchdog_s: 0.5}
+steps:
+  - {step: tare, time_s: 0.3}
+  - {step: approach, speed_mm_s: 8, trigger_N: 0.02, clearance_mm: 0.8}
+  - {step: cycles, cycles_count: 2, depth_mm: 2.8, speed_mm_s: 2, unload_speed_mm_s: 6}
+"""
+BENCH = """name: short
+rig: {url: "URL", map: reference, travel_mm: 60, force_limit_N: 20, indenter_radius_mm: 8}
+"""
+TEST = ("indent", "run", "S-0001", "--method", "short.yaml", "--bench", "bench.yaml", "--yes")
+ON = ("--bench", "bench.yaml")
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[SimulatedBench]:
+    """Return a lab with one specimen on a simulated rig: a spring of 0.5 N/mm from 6 mm on."""
+    (tmp_path / "design").mkdir()
+    lab = Workspace(tmp_path)
+    lab.new_specimen(tmp_path / "design")
+    (tmp_path / "short.yaml").write_text(METHOD)
+    words = ("--tcp", "0", "--truth", str(tmp_path / "truth"), "--specimen", "linear", "--contact-mm", "6")
+    with simulated_rig(*words, "--compliance-mm-N", "0", "--gain", "1", "--zero-N", "0.01") as url:
+        (tmp_path / "bench.yaml").write_text(BENCH.replace("URL", url))
+        yield SimulatedBench(lab, {"rig": url})
+
+
+def test_by_hand_the_stage_is_homed_jogged_to_the_first_touch_and_drawn_back(bench: SimulatedBench) -> None:
+    assert bench.fabctl("rig", "info", *ON)["state"] == "disarmed"
+    assert bench.fabctl("rig", "tare", *ON)["zero_N"] == pytest.approx(0.01, abs=2e-3)
+    assert bench.fabctl("rig", "home", *ON, "--yes")["position_mm"] == pytest.approx(0.0, abs=0.01)
+    bench.fabctl("rig", "jog", "3", *ON, expect=5)  # nobody said yes
+    assert bench.fabctl("rig", "info", *ON)["position_mm"] == pytest.approx(0.0, abs=0.01)
+    assert bench.fabctl("rig", "jog", "3", *ON, "--yes")["position_mm"] == pytest.approx(3.0, abs=0.01)
+    touched = bench.fabctl("rig", "jog", "20", *ON, "--yes", "--speed-mm-s", "4")
+    assert touched["force_gross_N"] == pytest.approx(1.05, abs=0.08)  # it brakes
+    assert touched["position_mm"] == pytest.approx(8.1, abs=0.2)
+    bench.fabctl(*TEST, expect=3)  # a test must not begin on a pressed specimen
+    drawn = bench.fabctl("rig", "retract", *ON, "--yes", "--speed-mm-s", "10")
+    assert drawn["position_mm"] == pytest.approx(0.0, abs=0.01)
+
+
+def broken_off(bench: SimulatedBench, number: signal.Signals) -> tuple[int, RunFolder]:
+    """Begin a test, send it a signal while it loads the second time; return its exit code and run."""
+    command = [sys.executable, "-m", "fabctl", "--home", str(bench.lab.root), *TEST]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=bench.lab.root, env=environment
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("load") and "curve 2" in line:
+            break
+    time.sleep(0.9)  # into contact
+    process.send_signal(number)
+    code = process.wait(timeout=30)
+    process.stderr.close()
+    (run,) = bench.lab.runs_of("S-0001", "indent")
+    return code, run
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, "stopped"), (signal.SIGKILL, "interrupted")])
+def test_a_test_that_was_broken_off_stands_where_it_is_and_goes_on_at_the_next_curve(
+    bench: SimulatedBench, number: signal.Signals, status: str
+) -> None:
+    code, first = broken_off(bench, number)
+    assert code == (5 if number == signal.SIGINT else -signal.SIGKILL)
+    assert status_of(first) == status
+    time.sleep(0.7)  # the watchdog's time
+    stands = bench.fabctl("rig", "info", *ON)
+    assert stands["position_mm"] > 5.5
+    assert stands["state"] == ("disarmed" if number == signal.SIGINT else "faulted")
+    told = [json.loads(row) for row in (bench.lab.root / "truth" / "rig-events.jsonl").read_text().splitlines()]
+    assert [one["bit"] for one in told if one["event"] == "fault"] == ([] if number == signal.SIGINT else [2])
+    bench.fabctl(*TEST, "--resume", first.run_id, expect=3)  # it stands on the specimen, or a fault is latched
+    bench.fabctl("rig", "clear", *ON, "--yes")
+    bench.fabctl("rig", "retract", *ON, "--yes", "--speed-mm-s", "10")
+
+    (bench.lab.root / "short.yaml").write_text(METHOD.replace("2.8", "2.7"))
+    bench.fabctl(*TEST, "--resume", first.run_id, expect=3)  # another method
+    (bench.lab.root / "short.yaml").write_text(METHOD)
+    found = bench.fabctl(*TEST, "--resume", first.run_id)
+    second = open_run(bench.lab.runs / str(found["run"]))
+    config = second.manifest()["config"]
+    assert config["resumes"] == first.run_id
+    assert [(a["kind"], a["curve"]) for a in config["plan"]] == [
+        ("tare", 0),
+        ("approach", 0),
+        ("load", 2),
+        ("unload", 2),
+    ]
+    assert [(curve["point"], curve["curve"]) for curve in found["curves"]] == [(0, 2)]
+    assert found["stiffness_secant_N_mm"] == pytest.approx(0.5, rel=0.02)
+    bench.fabctl(*TEST, "--resume", str(found["run"]), expect=3)  # that one came to its end
+    whole = bench.fabctl("indent", "analyse", first.run_id)["groups"][first.run_id]["runs"][0]
+    assert whole["status"] == status
+    assert whole["result"]["stiffness_secant_N_mm"] == pytest.approx(0.5, rel=0.02)  # of what was kept
