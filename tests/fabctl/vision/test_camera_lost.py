@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -56,7 +57,8 @@ def test_unplugged_or_frozen_before_the_yes_cuts_nothing_and_unplugged_afterward
     web_camera.pictures = [bed.frame(2)] * 9
     bench.fabctl(*cut_words(design), expect=REFUSED)
     assert not burnt()
-    assert not list((root / "runs").glob("*-cut-*"))
+    ended = [json.loads(file.read_text())["status"] for file in (root / "runs").glob("*-cut-*/outcome.json")]
+    assert set(ended) <= {"failed", "refused"}  # each attempt leaves its reason, and nothing else
     assert not list((root / "specimens").glob("S-*"))
 
     web_camera.pictures = [bed.frame(3), bed.frame(4)]
