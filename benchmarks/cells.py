@@ -33,7 +33,16 @@ SHEET = Sheet()
 PLAN = plan_of(SHEET)
 CORES = 2
 SAMPLE_COUNT = 120  # rows solved on the half-size mesh
-STATES = ((1.2, 3.0), (0.5, 0.0), (2.2, 0.0), (0.6, 15.0), (2.5, -12.0), (2.4, 1.4))  # t in mm, θ in degrees
+STATES = (
+    (1.2, 3.0),
+    (0.5, 0.0),
+    (2.2, 0.0),
+    (0.6, 15.0),
+    (2.5, -12.0),
+    (2.4, 1.4),
+    (2.84, -18.57),
+    (0.65, 21.43),
+)  # t in mm, θ in degrees
 
 
 def measure(words: list[str]) -> list[Figure]:

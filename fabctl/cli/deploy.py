@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import json_option, lab, progress, show
+from fabctl.cli.common import PLACE_MM, json_option, lab, progress, show
 from fabctl.cli.paths import InFolder, OutFolder
 
 if TYPE_CHECKING:

@@ -190,6 +190,20 @@ def test_P5_is_stable_in_the_two_by_two_cell(solved: tuple[Model, Pair]) -> None
     assert values[0] > 0
 
 
+def test_with_the_steepest_slits_P5_gives_way_to_a_mode_of_the_two_by_two_cell() -> None:
+    """Not what the paper assumes; no smaller cell shows it."""
+    found = solve_pair(0.65, math.radians(21.43), SHEET, REFERENCE)
+    assert isinstance(found, tuple)
+    m, pair = found
+    s = pair.stable.s_ratio
+    least = {}
+    for units in (2, 8):
+        cell = periodic_cell(m, units)
+        at = positions(cell, m, m.nodes(pair.stable.y, s), s)
+        least[units] = smallest_eigenvalues(cell, at, s * np.eye(2), 2)[0]
+    assert least[2] > 0 > least[8]
+
+
 def test_the_poisson_ratio_of_the_rubber_hardly_moves_the_expansion() -> None:
     ratios = [solve_cell(T_MM, THETA_RAD, replace(SHEET, nu_ratio=nu)).expansion_ratio for nu in (0.30, 0.45)]
     assert ratios[0] is not None and ratios[1] is not None
