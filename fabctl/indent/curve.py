@@ -18,7 +18,7 @@ Reals = NDArray[np.float64]
 
 LOCAL_MM = 0.35  # half the width of the local fits: some indenter-radius percent, many samples
 SMOOTH_MM = 0.6  # over a third of it the force is smoothed to look for extrema
-VERTEX_MM = (0.6, 1.0, 1.5, 2.0, 2.5, 3.0)  # half the widths over which an extremum is fitted, narrow to wide
+VERTEX_MM = (1.5, 2.0, 2.5, 3.0, 1.0, 0.6)  # half the widths over which an extremum is fitted, in their order
 AGREE_SIGMA, MISFIT_SIGMA = 3.0, 4.0  # a wider one must agree with the one before, and be followed by the cubic
 PROMINENCE_SIGMA = 6.0  # a peak must stand out of the noise by so much
 SNAP_SIGMA = 8.0  # a snap is a fall of the force between two samples of at least so many noises
@@ -227,7 +227,8 @@ def _first_maximum(smooth: Reals, loaded: NDArray[np.intp], band: float) -> int 
 def _vertex(depth: Reals, force_N: Reals, near: int) -> tuple[float, float]:
     """Return depth and force of the extremum near a sample: where a fitted cubic's slope is nothing, else the sample.
 
-    The widest window that the cubic follows and that agrees with the narrower ones: noise counts with its width^-1.5.
+    The widest window that the cubic follows and that agrees with the one before: noise counts with its width^-1.5.
+    Narrow ones, where a noise may tilt the cubic by much, only where it follows no other.
     """
     centre = float(depth[near])
     found: Vertex | None = None
@@ -235,6 +236,8 @@ def _vertex(depth: Reals, force_N: Reals, near: int) -> tuple[float, float]:
         wider = _cubic_vertex(depth, force_N, centre, half_mm)
         if wider is None:
             continue
+        if found is not None and half_mm < VERTEX_MM[0]:
+            break
         if found is not None and abs(wider.depth_mm - found.depth_mm) > AGREE_SIGMA * found.se_mm:
             break
         found = wider
