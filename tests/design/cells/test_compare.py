@@ -34,7 +34,7 @@ def test_headings_may_carry_units_and_cells_other_marks(mark: str) -> None:
 
 
 def test_an_angle_in_degrees_is_refused() -> None:
-    with pytest.raises(TableError, match="theta_rad is in deg, not rad"):
+    with pytest.raises(TableError, match="theta_rad is in deg, it must be in rad"):
         read_published(f"{HEADER.replace('theta_rad', 'theta_rad [deg]')}\n0.12,3,1.6,20,300\n", SHEET)
 
 
