@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from fabctl.deploying import Laid
     from fabctl.events import Emit
 
-PLACE_MM = click.FloatRange(-100_000, 100_000)
-
 
 @click.command()
 @click.argument("design", type=InFolder())
