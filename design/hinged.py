@@ -29,6 +29,11 @@ from design.pattern.tiling import Array
 RUNGS_COUNT = 5  # library widths between the narrowest and the widest hinge: a field bends little from one to the next
 
 
+def hinge_of(asked: HingeOptions | None, library: CellLibrary) -> HingeOptions:
+    """Return the hinge that is asked for, or the library's own, which grows and shrinks with the cell."""
+    return asked or HingeOptions("constant", library.sheet.hinge_mm)
+
+
 def hinged(library: CellLibrary, options: HingeOptions) -> CellLibrary:
     """Return the library whose tangent stands for a design's hinges: its own width, or the middle of a widening one."""
     added = options.added_mm / 2 if options.rule == "widening" else 0.0

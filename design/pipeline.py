@@ -20,7 +20,7 @@ from design.errors import OutOfLibrary
 from design.findings import Finding
 from design.flatten import Flattening, Limits, feasibility, flatten
 from design.flatten.ladder import Remedy
-from design.hinged import Widening, as_cut, hinge_range, hinged, widening
+from design.hinged import Widening, as_cut, hinge_of, hinge_range, hinged, widening
 from design.job import Job, JobOptions, compose_job
 from design.limits import check_count
 from design.pattern.assign import averaged, factor
@@ -155,22 +155,23 @@ def cells_on_offer(
     """
     if spec.cells == "contracting":
         return library, library, selection_curve(library, spec.selection), None
-    if spec.hinge.rule == "constant" and abs(spec.hinge.width_mm - library.sheet.hinge_mm) < HINGE_SAME_MM:
+    hinge = hinge_of(spec.hinge, library)
+    if hinge.rule == "constant" and abs(hinge.width_mm - library.sheet.hinge_mm) < HINGE_SAME_MM:
         curve = None if spec.selection.rule == "published" else selection_curve(library, spec.selection)
         return library, library, curve, None
-    cut = hinged(library, spec.hinge)
+    cut = hinged(library, hinge)
     if spec.selection.rule == "published":
         return library, cut, None, None
-    if spec.hinge.rule == "constant":
+    if hinge.rule == "constant":
         return library, cut, selection_curve(cut, spec.selection), None
-    wide = widening(library, spec.hinge, spec.selection)
+    wide = widening(library, hinge, spec.selection)
     return library, cut, wide.curve(), wide
 
 
 def hinges_mm(spec: DesignSpec, choice: Choice, library: CellLibrary) -> Array:
     """Return the hinge of every cell `(k,)`; a contracting cell's is the slit cell's, drawn smaller with its unit."""
     if spec.cells == "expanding":
-        return hinge_widths_mm(choice.expansion_ratio, spec.hinge)
+        return hinge_widths_mm(choice.expansion_ratio, hinge_of(spec.hinge, library))
     return library.sheet.hinge_mm / at_cells(library, "open_ratio", choice.t_mm, choice.theta_rad)
 
 

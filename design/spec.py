@@ -50,7 +50,7 @@ class DesignSpec:
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     selection: SelectionOptions = field(default_factory=SelectionOptions)
     placement: Placement = "optimised"
-    hinge: HingeOptions = field(default_factory=HingeOptions)
+    hinge: HingeOptions | None = None  # None: the library's own
     passive: tuple[Region, ...] = ()  # not cut: flat and stiff
     monostable: tuple[Region, ...] = ()  # cut, but they spring back
     border: BorderOptions = field(default_factory=BorderOptions)

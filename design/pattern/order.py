@@ -25,7 +25,7 @@ RUN_COUNT = 3  # strokes moved together at most
 KICK_COUNT = 30  # strokes in a run that a kick moves at most
 KICK_CHAIN_COUNT, KICK_FIRST_COUNT = 6, 2  # the same while a kick is repaired
 KICK_REACH_COUNT = 1000  # ends turned around in one exchange while a kick is repaired: more costs more than it gains
-KICKS_LIMIT_COUNT = 6000  # about a second, on 20,000 strokes a third of the whole
+KICKS_LIMIT_COUNT = 3000  # half a second, on 20,000 strokes a fifth of the whole
 GAIN_MM = 1e-7  # less is rounding
 
 

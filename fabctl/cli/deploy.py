@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import json_option, lab, progress, show
+from fabctl.cli.common import PLACE_MM, json_option, lab, progress, show
 from fabctl.cli.paths import InFolder, OutFolder
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 @click.option(
     "--hint",
     "hints",
-    type=(float, float, click.Choice(["up", "down"])),
+    type=(PLACE_MM, PLACE_MM, click.Choice(["up", "down"])),
     multiple=True,
     metavar="X Y up|down",
     help="Push the bump at X, Y (mm from the middle of the cells' box) to a side; may be given again.",

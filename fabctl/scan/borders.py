@@ -28,6 +28,7 @@ SEEN_RATIO, EMPTY_RATIO = 0.4, 0.15  # of the usual number of points in a ball
 REFUTED, FREE, BORNE_OUT = 0.2, 0.05, 0.5  # shares of a loop
 SPINS = 240
 ANGLES_KEPT, APART_RAD = 4, 0.2
+OPEN_RAD = 0.3  # the border never tells turns much nearer than this apart by what crosses it
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +104,8 @@ class Circle:
         return [self.poses[k] for k in picked]
 
     def open_elsewhere(self) -> bool:
-        """Return whether a turn apart from the first pose's own stretch is not contradicted either."""
-        if len(self.poses) == 0:
-            return False
-        sorted_rad = np.sort(np.concatenate([self.angles_rad, [0.0]]))
-        steps = np.diff(np.concatenate([sorted_rad, [sorted_rad[0] + 2 * np.pi]]))
-        return bool((steps > 2.5 * 2 * np.pi / SPINS).sum() > 1)
+        """Return whether a turn well away from the first pose is not contradicted either."""
+        return bool((np.abs(self.angles_rad) > OPEN_RAD).any())
 
 
 def _angle(angle: float) -> float:

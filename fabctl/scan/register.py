@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from design.findings import Finding
 from fabctl.events import Emit, Event, silent
-from fabctl.scan.borders import circle, rim_axis, turn_motion
+from fabctl.scan.borders import Circle, circle, rim_axis, turn_motion
 from fabctl.scan.clean import Cleaned, Part
 from fabctl.scan.coarse import search, search_cloud
 from fabctl.scan.decide import HELD_FRAC, Datums, decide_by_border, decide_by_datums, decide_by_paint
@@ -158,13 +158,24 @@ def pushed(task: Task, body: Body, best: Judged) -> list[Judged]:
 
 def _turned(task: Task, body: Body, best: Judged) -> list[Similarity]:
     """Return the pose turned about the rim's axis to where the rest of the border fits, if the surface allows it."""
+    turns = _turns(task, body, best)
+    return [] if turns is None else turns.likeliest()
+
+
+def _open_turns(task: Task, body: Body, best: Judged) -> list[Similarity]:
+    """Return turns well away from the pose that neither surface nor border speak against: no rival was better."""
+    turns = _turns(task, body, best)
+    return turns.likeliest() if turns is not None and turns.open_elsewhere() else []
+
+
+def _turns(task: Task, body: Body, best: Judged) -> Circle | None:
     axis = rim_axis(task.target)
     if axis is None or task.symmetries.continuous:
-        return []
+        return None
     finder = edge_finder(body.dense, best.pose, task.target)
     if finder is None or not is_weak(turn_motion(axis, task.target), best.fit, task.target, HELD_FRAC):
-        return []
-    return circle(body.tree, finder, best.pose, axis).likeliest()
+        return None
+    return circle(body.tree, finder, best.pose, axis)
 
 
 def register(task: Task) -> Registration:
@@ -217,6 +228,8 @@ def _decided(task: Task, body: Body, found: list[Judged]) -> Registration:
         if painted is not None:
             others = tuple(j for j in (best, *turned, *rivals) if j.fit.patches is not painted.fit.patches)
             return _finished(task, "aligned", painted, others, body, "colour")
+    if not rivals and not turns:
+        rivals = [tried(task, body, start, "turned: the border allows it") for start in _open_turns(task, body, best)]
     if rivals and not turns:
         finder = edge_finder(body.dense, best.pose, task.target)
         single_out = None if finder is None else decide_by_border(finder, body.tree, [best, *rivals], task.symmetries)
@@ -238,15 +251,14 @@ def _settled(task: Task, body: Body, found: list[Judged]) -> list[Judged]:
     two poses may be one.
     """
     best = found[0]
+    if rim_axis(task.target) is not None:
+        return found  # what a hole holds is decided by its edge; poses sharpened alone would beat the others unfairly
     near = [j for j in _rivals(found) if task.symmetries.apart_frac(best.pose, j.pose, task.target) < NEAR_POSE_FRAC]
     if not near:
         return found
     rest = [j for j in found[1:] if not any(j is n for n in near)]
-    again = [refine(body.dense, j.pose, task.target, task.options) for j in (best, *near)]
-    sharper = [
-        judge(fit, body.even[:JUDGE_POINTS], body.dense, task.target, j.relation)
-        for fit, j in zip(again, (best, *near), strict=True)
-    ]
+    # Only their places are sharpened: with a better score they would beat poses farther off that were not.
+    sharper = [replace(j, fit=refine(body.dense, j.pose, task.target, task.options)) for j in (best, *near)]
     return _distinct(task, [*sharper, *rest])
 
 

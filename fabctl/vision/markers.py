@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -47,6 +47,8 @@ SAME_QUAD_RATIO = 0.02  # of the side: nearer outlines are one and the same
 SCREEN_RATIO = 0.45  # correlation with the bare frame that a quadrilateral needs to be looked at further
 BLURS_px = (0.5, 0.9, 1.4, 2.0, 3.0)
 COARSE_PER_MODULE = 3
+LARGE_MODULE_PX, SMALL_MODULE_PX = 14.0, 8.0  # modules of more than the first are read at no more than the second
+LEAST_SMALL_PX = 8
 LIKELY_COUNT = 24  # codes that are compared at every blur
 
 
@@ -147,9 +149,50 @@ def mirrored(image: NDArray[np.uint8], family: Family = "5x5_250") -> list[Marke
 
 
 def read_quadrilateral(grey: F64, quad: F64, family: Family, inverted: bool = False) -> Marker | None:
-    """Return the marker of which `quad` (4, 2), clockwise on the screen, is about the outline; None where none is."""
+    """Return the marker of which `quad` (4, 2), clockwise on the screen, is about the outline; None where none is.
+
+    Where modules are large the marker is read in a smaller picture of its surroundings: samples far apart would mostly
+    miss the edges, and those that an outline puts off them would not find back.
+    """
     modules = codes(family).shape[1]
     H = homography(CORNERS, quad)
+    halvings = _halvings(H, modules)
+    if halvings:
+        low = np.maximum(np.floor(quad.min(axis=0) - 0.5 * np.ptp(quad, axis=0)), 0)
+        small = _halved(grey, low, np.ceil(quad.max(axis=0) + 0.5 * np.ptp(quad, axis=0)), halvings)
+        if min(small.shape) < LEAST_SMALL_PX:
+            return None
+        marker = _read(small, homography(CORNERS, (quad - low) / 2**halvings), family, inverted)
+        return None if marker is None else _enlarged(marker, low, 2**halvings)
+    return _read(grey, H, family, inverted)
+
+
+def _halvings(H: F64, modules: int) -> int:
+    """Return how often the surroundings of an outline are halved before a marker is sought in it."""
+    px = max(module_px(H, modules))
+    return min(math.ceil(math.log2(px / SMALL_MODULE_PX)), 8) if LARGE_MODULE_PX < px < math.inf else 0
+
+
+def _halved(grey: F64, low: F64, high: F64, count: int) -> F64:
+    """Return the picture from corner to corner, smoothed and halved `count` times; its corner stays pixel (0, 0)."""
+    import cv2
+
+    (left, upper), (right, lower) = low.astype(int), high.astype(int)
+    small = grey[upper:lower, left:right]
+    for _ in range(count if small.size else 0):
+        small = np.asarray(cv2.pyrDown(small), dtype=np.float64)
+    return small
+
+
+def _enlarged(marker: Marker, corner_px: F64, factor: int) -> Marker:
+    """Return a marker as the picture shows it, of which it was read in a part from `corner_px` on, made smaller."""
+    grow = np.array([[factor, 0, corner_px[0]], [0, factor, corner_px[1]], [0, 0, 1.0]])
+    blur_px, module = marker.blur_px * factor, marker.module_px * factor
+    return replace(marker, H=grow @ marker.H, blur_px=blur_px, module_px=module)
+
+
+def _read(grey: F64, H: F64, family: Family, inverted: bool) -> Marker | None:
+    modules = codes(family).shape[1]
     size_px = math.sqrt(math.prod(module_px(H, modules)))
     places = sample_grid(modules, COARSE_PER_MODULE)
     grid = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)

@@ -55,7 +55,7 @@ def test_every_command_a_page_names_exists(name: str) -> None:
 def test_every_number_on_the_command_line_has_two_ends() -> None:
     ranges = click.FloatRange | click.IntRange
     numbers = [
-        (path, param.opts[-1], param.type)
+        (path, param.opts[-1], kind)
         for path, found in every_command()
         for param in found.params
         for kind in (param.type.types if isinstance(param.type, click.Tuple) else [param.type])

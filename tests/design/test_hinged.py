@@ -96,3 +96,9 @@ def test_a_design_says_which_expansions_its_hinges_leave() -> None:
     told = {finding.code: finding.message for finding in made(HingeOptions("constant", 0.36)).findings}
     assert "with the library's 0.25 mm from" in told["HINGE-RANGE"]
     assert "HINGE-RANGE" not in {finding.code for finding in made(HingeOptions()).findings}
+
+
+def test_a_design_of_small_cells_takes_the_librarys_own_hinge_where_none_is_asked_for() -> None:
+    small = load_library().scaled(Sheet(edge_mm=5, slit_mm=0.0625, hinge_mm=0.125))
+    design = build(DesignSpec("small", cell_mm=5, response=None), cap(radius_mm=40, edge_mm=5), small, PRESETS)
+    assert np.unique(design.cells.hinge_mm) == pytest.approx([0.125])

@@ -15,7 +15,7 @@ from fabctl.coupon import keep_result, read_form
 from fabctl.cut.compose import composer, open_design, sheet_of
 from fabctl.cut.program import read_program
 from fabctl.designing import write_coupon
-from fabctl.errors import RefusedError
+from fabctl.errors import RefusedError, UsageError
 from fabctl.records.folder import start_run
 from fabctl.reports.page import render
 from fabctl.reports.specimen import specimen_report
@@ -51,7 +51,7 @@ def test_every_fault_of_a_form_is_told_at_once(tmp_path: Path) -> None:
     assert {"COUPON-CYCLES", "COUPON-LENGTH", "COUPON-TWICE"} <= set(codes)
     with pytest.raises(RefusedError):
         read_form(form(tmp_path, "a,b\n1,2\n"), 0.2)
-    with pytest.raises(RefusedError):
+    with pytest.raises(UsageError, match="no such file"):
         read_form(tmp_path / "nothing.csv", 0.2)
 
 

@@ -74,7 +74,7 @@ def test_a_smaller_cell_scales_slit_and_hinge_and_overrides_the_file(tmp_path: P
     inputs = read_inputs(str(tmp_path / "spec.yaml"), tmp_path, cell_mm=5.0)
     assert inputs.spec.cell_mm == inputs.library.sheet.edge_mm == 5.0
     assert inputs.library.sheet.slit_mm == pytest.approx(0.0625)
-    assert inputs.spec.hinge.width_mm == pytest.approx(0.125)
+    assert inputs.spec.hinge is not None and inputs.spec.hinge.width_mm == pytest.approx(0.125)
 
 
 def test_a_name_that_is_a_specification_is_checked_as_it_would_be_built(tmp_path: Path) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from design.targets import vase
 from fabctl.scan.clean import clean
 from fabctl.scan.decide import Datums
-from fabctl.scan.register import Registration, Task, register
+from fabctl.scan.refine import patch_rows
+from fabctl.scan.register import Registration, Task, register, specimen_points
 from fabctl.scan.said import left_aside
-from fabctl.scan.similarity import Similarity
+from fabctl.scan.similarity import IDENTITY, Similarity
 from fabctl.scan.symmetry import find_symmetries
 from fabctl.scan.target import Target
 from simulators.photogrammetry import ScanPlan
@@ -90,3 +92,23 @@ def test_another_thing_of_the_specimens_size_is_told() -> None:
     for other, said in ((points + np.array([250.0, 0.0, 0.0]), ["SCAN-OTHERS"]), (small, [])):
         cleaned = clean(np.concatenate([points, other]))
         assert [f.code for f in left_aside(cleaned, cleaned.parts[0])] == said
+
+
+def test_the_points_noise_does_not_go_into_how_the_scale_is_found() -> None:
+    target = TARGETS["freeform"]
+    points, normals, _ = target.even_samples(6000)
+    patches = cKDTree(target.even_samples(200)[0])
+    exact = patch_rows(points, IDENTITY, target, patches, 0.05)
+    lifted = patch_rows(points + 0.01 * target.diagonal_mm * normals, IDENTITY, target, patches, 0.05)
+    assert np.median(np.abs(exact.jacobian[:, 6] - lifted.jacobian[:, 6])) < 1e-3
+
+
+def test_no_point_is_compared_whose_place_on_the_target_is_too_near_the_table() -> None:
+    made, target = scanned("cap", RAW), TARGETS["cap"]
+    cleaned, pose = clean(made.points, 3), true_pose(made)
+    task = Task(made.points, cleaned, target, symmetries_of("cap"), seed=3)
+    kept = made.points[specimen_points(task, cleaned.parts[0], pose)]
+    assert cleaned.table is not None
+    height = cleaned.table.height(pose.inverse()(target.closest(pose(kept)).points_mm))
+    assert len(kept) > 5000
+    assert height.min() > cleaned.table_top_cu

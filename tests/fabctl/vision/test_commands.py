@@ -119,7 +119,7 @@ def test_a_bed_is_aligned_by_the_run_that_engraved_its_marks(fabctl: Fabctl, ali
     mark = BED.mark(witness["id"])
     assert mark is not None
     assert (witness["x_mm"], witness["y_mm"]) == pytest.approx((mark.x_mm - 300, mark.y_mm - 200))
-    with pytest.raises(UsageError, match="no such run"):
+    with pytest.raises(UsageError, match="2020-marks"):
         fabctl(*words, "2020-marks")
 
 

@@ -31,15 +31,15 @@ def photograph(
     drawn = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250), number, 7 * unit)
     page = np.full((11 * unit, 11 * unit), 255, np.uint8)
     page[2 * unit : 9 * unit, 2 * unit : 9 * unit] = drawn
-    size = int(module_px * 16)
+    size, fine_by = int(module_px * 16), SUPER if module_px < 12 else 2
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     middle = np.array([[1, 0, -(5.5 * unit - 0.5)], [0, 1, -(5.5 * unit - 0.5)], [0, 0, 1.0]])
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
     tilt = np.array([[1, 0, 0], [0, np.cos(tilt_rad), 0], [0, np.sin(tilt_rad) / (60 * unit), 1.0]])
     place = np.array([[module_px / unit, 0, size / 2 + 0.3], [0, module_px / unit, size / 2 - 0.2], [0, 0, 1.0]])
     M = place @ tilt @ turn @ middle
-    fine = np.array([[SUPER, 0, (SUPER - 1) / 2], [0, SUPER, (SUPER - 1) / 2], [0, 0, 1.0]])
-    big = cv2.warpPerspective(page, fine @ M, (size * SUPER, size * SUPER), borderValue=255)
+    fine = np.array([[fine_by, 0, (fine_by - 1) / 2], [0, fine_by, (fine_by - 1) / 2], [0, 0, 1.0]])
+    big = cv2.warpPerspective(page, fine @ M, (size * fine_by, size * fine_by), borderValue=255)
     small = cv2.resize(big, (size, size), interpolation=cv2.INTER_AREA).astype(float) / 255
     grey = 200 * (1 - contrast * (1 - cv2.GaussianBlur(small, (0, 0), blur_px)))
     noisy = grey + np.random.default_rng(number).normal(0, 2, grey.shape)
@@ -52,6 +52,16 @@ def test_a_marker_is_found_to_a_twentieth_of_a_pixel_however_it_is_turned(turn_r
     (marker,) = find_markers(picture)
     assert marker.id == 17
     assert marker.centre_px == pytest.approx(centre, abs=0.05)
+
+
+@pytest.mark.parametrize("blur_px", [0.5, 1.0, 2.5])
+@pytest.mark.parametrize("module_px", [13.0, 16.0, 24.0, 40.0, 70.0])
+def test_a_marker_of_large_modules_is_found_as_exactly_for_its_size(module_px: float, blur_px: float) -> None:
+    """As a telephone of many megapixels shows it."""
+    picture, centre = photograph(17, module_px, 0.7, tilt_rad=0.3, blur_px=blur_px)
+    (marker,) = find_markers(picture)
+    assert marker.id == 17
+    assert marker.centre_px == pytest.approx(centre, abs=0.01 * module_px)
 
 
 def test_the_first_corner_is_the_upper_left_one_of_the_marker_itself() -> None:

@@ -185,7 +185,9 @@ def test_a_picture_of_fifty_megapixels_is_read_and_searched_in_seconds(tmp_path:
     page = np.full((6000, 8400), 190, np.uint8)
     drawn = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250), 7, 420)
     page[3000:3420, 5000:5420] = np.maximum(drawn, 40)
-    cv2.imwrite(str(tmp_path / "large.jpg"), page)
+    cv2.imwrite(str(tmp_path / "large.jpg"), cv2.GaussianBlur(page, (0, 0), 2.0))  # no lens is sharper at that size
     began_s = time.process_time()
-    assert [m.id for m in find_markers(read_picture(tmp_path / "large.jpg").image)] == [7]
+    (marker,) = find_markers(read_picture(tmp_path / "large.jpg").image)
+    assert marker.id == 7
+    assert marker.centre_px == pytest.approx([5209.5, 3209.5], abs=0.3)
     assert time.process_time() - began_s < 40
