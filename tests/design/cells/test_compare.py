@@ -41,9 +41,8 @@ def test_an_angle_in_degrees_is_refused() -> None:
 def test_the_order_of_the_rows_changes_nothing() -> None:
     """Each column is walked along t, whatever order its rows stand in."""
     library = load_library()
-    rows = [
-        f"{library.t_mm[k] / 10!r},{library.theta_rad[k]!r},{library.expansion_ratio[k]!r},1,1" for k in range(500, 530)
-    ]
+    columns = zip(library.t_mm / 10, library.theta_rad, library.expansion_ratio, strict=True)
+    rows = [",".join([*map(repr, map(float, values)), "1", "1"]) for values in list(columns)[500:530]]
     mixed = [rows[k] for k in np.random.default_rng(4).permutation(len(rows))]
     plain, other = (
         {(c.t_mm, c.theta_rad): c for c in solve_rows(read_published("\n".join([HEADER, *lines]), SHEET), SHEET)}

@@ -117,5 +117,5 @@ def test_another_hinge_needs_another_library(library: CellLibrary) -> None:
 def test_a_file_that_is_no_library_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "cells.npz"
     path.write_bytes(b"no")
-    with pytest.raises(LibraryError, match="not a library"):
+    with pytest.raises(LibraryError, match="no library of cells"):
         load_library(path)
