@@ -31,7 +31,7 @@ def published_library(path: Path) -> CellLibrary:
         content = path.read_bytes()
         rows = read_published(content.decode("utf-8-sig"), Sheet())
     except (OSError, UnicodeDecodeError, TableError) as fault:
-        raise LibraryError(f"{path}: not a published map of cells: {fault}") from fault
+        raise LibraryError(f"{path}: not a published map of cells: {_why_not(fault)}") from fault
     sheet = Sheet()
     table = _table(path, rows, sheet)
     key = hashlib.sha256(content).hexdigest()
@@ -43,6 +43,12 @@ def published_library(path: Path) -> CellLibrary:
         "command": f"the published map {path.name}",
     }
     return CellLibrary.of_table(table, meta, key, sheet)
+
+
+def _why_not(fault: Exception) -> str:
+    if isinstance(fault, UnicodeDecodeError):
+        return "it is no text"
+    return (fault.strerror or "cannot be read").lower() if isinstance(fault, OSError) else str(fault)
 
 
 def _table(path: Path, rows: Published, sheet: Sheet) -> dict[str, Array]:

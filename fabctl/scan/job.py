@@ -93,6 +93,7 @@ class Comparison:
     statistics: Statistics | None = None
     uncertainty: Uncertainty | None = None
     alternative_rms_mm: tuple[float, ...] = ()
+    foreseen: Target | None = None  # the predicted deployed shape, where there is one
     predicted: Predicted | None = None
     verdict: Verdict = "undecided"
     findings: tuple[Finding, ...] = field(default_factory=tuple)
@@ -125,6 +126,7 @@ def read_target(path: Path) -> Target:
 def compare(request: Request, emit: Emit = silent) -> Comparison:
     """Return the comparison that is asked for; the same files, options and seed give the same numbers."""
     target = read_target(request.target)
+    foreseen = None if request.predicted is None else read_target(request.predicted)
     emit(Event("stage", f"reading {request.cloud}"))
     cloud = read_cloud(request.cloud, request.seed)
     paint = _paint(request, cloud)
@@ -147,7 +149,7 @@ def compare(request: Request, emit: Emit = silent) -> Comparison:
     )
     registration = register(task)
     registration = _by_mode(request.mode, task, registration)
-    made = Comparison(request, target, cloud, cleaned, registration, scale)
+    made = Comparison(request, target, cloud, cleaned, registration, scale, foreseen=foreseen)
     findings = [*cloud.findings, *(scale.findings if scale is not None else ()), *registration.findings]
     if registration.status not in ("aligned", "symmetric") or registration.best is None:
         return replace(made, findings=tuple(findings))
@@ -250,9 +252,9 @@ def _verdict(numbers: Statistics, tolerance_frac: float | None) -> Verdict:
 
 def _against_predicted(made: Comparison, best: Judged, points: Floats, numbers: Statistics) -> Predicted | None:
     """Return the comparison with the predicted shape, aligned to it from the pose on the target."""
-    if made.request.predicted is None:
+    shape = made.foreseen
+    if shape is None:
         return None
-    shape = read_target(made.request.predicted)
     options = Options(free_scale=made.scale is None)
     fit = refine(points[:: max(1, len(points) // FINAL_POINTS)], best.pose, shape, options)
     found = statistics(deviate(points, fit.pose, shape), shape)

@@ -113,6 +113,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
         words = ["--home", str(home), "camera", "board", "marks", kind, "--size-mm", "300x200"]
         assert runs.invoke(cli, words, catch_exceptions=False).exit_code == DONE
     assert runs.invoke(cli, ["--home", str(home), "camera", "board", "charuco"]).exit_code == DONE
+    coupon = ["kerf", "coupon", "--material", "natural-rubber-2.3", "-o", str(home / "coupon")]
+    assert runs.invoke(cli, ["--home", str(home), *coupon]).exit_code == DONE
     return home
 
 
@@ -129,7 +131,8 @@ def good(name: str, lab: Path) -> list[str]:
         "response": lab / "design/response.csv",
         "published": lab / "form.csv",
         "image": lab / "picture.png",
-        "coupon_file": lab / "design/manifest.json",
+        "coupon_file": lab / "coupon/coupon.json",
+        "folder": lab / "coupon",
         "clouds": lab / "cloud.xyz",
         "material": "natural-rubber-2.3",
         "spec": "cap",
