@@ -105,7 +105,7 @@ def test_bars_picked_on_the_cloud_give_the_scale(scanned: Scanned, tmp_path: Pat
     ("text", "said"),
     [
         ("0,0,0,1,0,0", r"bars\.csv:1: 6 values"),
-        ("0,0,0,1,0,0,ten", r"bars\.csv:1: not a number"),
+        ("0,0,0,1,0,0,ten", r"bars\.csv:1: not numbers"),
         ("x1,y1,z1,x2,y2,z2,length_mm\n", "no bars"),
         ("0,0,0,nan,0,0,10", r"bars\.csv:1"),
     ],
