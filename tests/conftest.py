@@ -5,7 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+# What is drawn must hold, however long a busy machine takes over it.
+hypothesis.settings.register_profile("patient", deadline=None)
+hypothesis.settings.load_profile("patient")
 
 pytest_plugins = ["fabctl.testing"]  # what a lab's own tests get by installing the package
 ROOT = Path(__file__).resolve().parents[1]

@@ -87,12 +87,12 @@ def identify(messages: Iterable[Message], idle: Report | None) -> Identity:
                 modes = message.text
             elif message.kind.startswith("G") and "," in message.text:
                 offsets |= _offset(message)
-    rx_bytes = int(fields[1]) if len(fields) > 1 and fields[1].isdigit() else None
+    rx_bytes = int(fields[1]) if len(fields) > 1 and fields[1].isdecimal() and len(fields[1]) < 7 else None
     if rx_bytes is None and idle is not None and idle.state == "Idle":
         rx_bytes = idle.free_bytes
     if rx_bytes is None or rx_bytes < RX_LEAST_BYTES:
         rx_bytes = RX_FALLBACK_BYTES
-    blocks = int(fields[0]) if fields and fields[0].isdigit() else PLANNER_FALLBACK_COUNT
+    blocks = int(fields[0]) if fields and fields[0].isdecimal() and len(fields[0]) < 7 else PLANNER_FALLBACK_COUNT
     return Identity(firmware, version, options, rx_bytes, blocks, settings, offsets, modes, tuple(startup))
 
 

@@ -19,7 +19,7 @@ class LaserConfig(Model):
     url: str
     travel_mm: tuple[Positive, Positive]
     spot_mm: Positive = 0.1
-    max_run_on_s: Positive = 5.0
+    max_run_on_s: Annotated[float, Field(ge=0.1, le=600)] = 5.0
     homing: bool = True
     origin_mm: tuple[float, float] = (0.0, 0.0)
     allow_m3: bool = False

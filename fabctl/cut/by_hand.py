@@ -36,6 +36,8 @@ def run_here(laser: Laser, bench: Bench, lines: Sequence[str], power_frac: float
         found.append(Finding("CUT-LOCKED", "the board is locked", hint="fabctl laser home"))
     if any(step.burns for step in program.steps) and not identity.is_on(32):
         found.append(Finding("CUT-LASER-MODE", "the board is not in laser mode ($32=0)", hint="$32=1"))
+    if identity.is_on(13):
+        found.append(Finding("CUT-INCHES", "the board reports inches ($13=1)", hint="fabctl laser settings 13=0"))
     bounds, box = plan.bounds_mm(), travel_box_mm(identity, config.travel_mm)
     if bounds is not None and identity.is_on(22):
         low, high = zip(bounds[:2], box[:2], strict=True), zip(bounds[2:], box[2:], strict=True)

@@ -209,6 +209,11 @@ def check(
                 limit=rig.travel_mm,
             )
         )
+    if method.safe_height_mm >= method.limits.travel_mm:
+        found.append(_beyond("METHOD-SAFE-HEIGHT", "the safe height", method.safe_height_mm, method))
+    deepest_mm = max((a.depth_mm for a in plan if a.depth_mm is not None), default=0.0)
+    if deepest_mm > method.limits.travel_mm:
+        found.append(_beyond("METHOD-DEPTH", "the greatest depth", deepest_mm, method))
     if any(action.kind == "travel" for action in plan) and not has_stage:
         found.append(Finding("METHOD-STAGE", "the method has a grid, and this rig's map has no stage to move"))
     for action in plan:
@@ -257,6 +262,12 @@ def _against(predicted: Predicted, deepest_mm: float, method: MethodConfig, rig:
             f"predicted for a sphere of {radius:g} mm, on the rig is one of {rig.indenter_radius_mm:g} mm",
             "warning",
         )
+
+
+def _beyond(code: str, what: str, value_mm: float, method: MethodConfig) -> Finding:
+    limit_mm = method.limits.travel_mm
+    text = f"{what}, {value_mm:g} mm, lies beyond the method's travel of {limit_mm:g} mm"
+    return Finding(code, text, value=value_mm, unit="mm", limit=limit_mm)
 
 
 def _out_of_reach(plan: Sequence[Action], predicted: Predicted) -> Iterator[Finding]:

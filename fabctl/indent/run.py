@@ -118,7 +118,7 @@ class Runner:
                 self._do_or_pass_by(action)
             self.sampler.action = Action("travel")
             self.sampler.time_left.begin(len(self.plan), self.clock.now_s())
-            self._drive(self.method.safe_height_mm, self.method.travel_speed_mm_s)
+            self._draw_back()
         finally:
             self._leave()
         return self.ending
@@ -289,9 +289,14 @@ class Runner:
         self.emit(Event("wait", message))
         self.sampler.while_held(lambda: not self.go_on(message))
 
+    def _draw_back(self) -> None:
+        """Go up to the safe height; where the indenter is above it, it stays: a way down is no way out."""
+        if self.rig.fresh_sample().position_mm > self.method.safe_height_mm:
+            self._drive(self.method.safe_height_mm, self.method.travel_speed_mm_s)
+
     def _travel(self, action: Action) -> None:
         assert action.at_mm is not None
-        self._drive(self.method.safe_height_mm, self.method.travel_speed_mm_s)
+        self._draw_back()
         x_mm, y_mm = action.at_mm
         self._whole(lambda: self.rig.move_stage(x_mm, y_mm, action.speed_mm_s))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -31,7 +32,13 @@ RUBBER = MaterialConfig(
     laser=LaserPreset(slit=LAYER, outline=LAYER, engrave=LAYER, mark=LAYER, kerf_mm=0.125, air_assist=False),
 )  # fmt: skip
 PROGRAM = read_program(slits(20))
-BEGIN = {"work_offset_mm": [0.0, 0.0, 0.0], "placement": Affine().rows()}
+TEXT = "\n".join(PROGRAM.lines) + "\n"
+BEGIN = {
+    "work_offset_mm": [0.0, 0.0, 0.0],
+    "placement": Affine().rows(),
+    "bench": {"name": "small"},
+    "plan": {"job_sha256": hashlib.sha256(TEXT.encode("ascii")).hexdigest()},
+}
 
 
 @dataclass
@@ -72,7 +79,7 @@ def cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cut:
     (design / "manifest.json").write_text('{"name": "dome"}')
     specimen = lab.new_specimen(design)
     run = start_run(lab.runs, "cut", specimen=specimen.name, config=BEGIN)
-    run.artefact("job.nc").write_text("\n".join(PROGRAM.lines) + "\n")
+    run.artefact("job.nc").write_text(TEXT)
     (run.path / "wire.log").write_text("\n".join(rows) + "\n")
     run.finish("failed", "the host was killed")
     laser = LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0))
@@ -124,6 +131,19 @@ def test_a_lost_position_that_cannot_be_found_again_is_refused(cut: Cut, how: st
     assert code == "RESUME-LOST"
     assert "position was lost" in text
     assert "home the machine" in text
+
+
+def test_a_program_that_is_not_the_one_sent_is_refused(cut: Cut) -> None:
+    cut.run.artefact("job.nc").write_text(TEXT.replace("S", "S1", 1))
+    code, _ = cut.refused()
+    assert code == "RESUME-PROGRAM"
+
+
+def test_another_bench_is_refused_by_name(cut: Cut) -> None:
+    cut.bench.config.name = "elsewhere"
+    code, text = cut.refused()
+    assert code == "RESUME-BENCH"
+    assert "elsewhere" in text
 
 
 def test_another_work_offset_is_refused_with_both(cut: Cut) -> None:

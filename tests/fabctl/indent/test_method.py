@@ -122,6 +122,12 @@ def test_a_grid_on_a_rig_without_a_stage_is_refused() -> None:
     assert "METHOD-STAGE" in codes(load_method("grid", NOWHERE), has_stage=False)
 
 
+def test_depths_and_safe_heights_beyond_the_travel_are_refused() -> None:
+    steps = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n  - {step: load, depth_mm: 1.0e+300, speed_mm_s: 1}\n"
+    found = parse(HEAD.replace("steps:", "safe_height_mm: 400\nsteps:") + steps, MethodConfig, "m.yaml")
+    assert {"METHOD-SAFE-HEIGHT", "METHOD-DEPTH"} <= codes(found)
+
+
 def test_limits_beyond_the_bench_are_refused() -> None:
     found = parse(HEAD.replace("5", "50").replace("40", "80") + "  - {step: tare}\n", MethodConfig, "m.yaml")
     assert {"METHOD-FORCE", "METHOD-TRAVEL"} <= codes(found)
