@@ -123,7 +123,8 @@ def test_a_grid_on_a_rig_without_a_stage_is_refused() -> None:
 
 
 def test_depths_and_safe_heights_beyond_the_travel_are_refused() -> None:
-    steps = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n  - {step: load, depth_mm: 1.0e+300, speed_mm_s: 1}\n"
+    steps = "  - {step: tare}\n  - {step: approach, speed_mm_s: 1, trigger_N: 0.1}\n"
+    steps += "  - {step: load, depth_mm: 1.0e+300, speed_mm_s: 1}\n"
     found = parse(HEAD.replace("steps:", "safe_height_mm: 400\nsteps:") + steps, MethodConfig, "m.yaml")
     assert {"METHOD-SAFE-HEIGHT", "METHOD-DEPTH"} <= codes(found)
 
