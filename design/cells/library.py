@@ -164,6 +164,13 @@ class CellLibrary:
         """Return the library of a table of candidates, whose `meta` says for which sheet it stands."""
         return _with_sheet(table, meta, key, sheet)
 
+    def firm(self) -> CellLibrary:
+        """Return the library without its shallow wells: where the mesh changes, the map has a small step."""
+        shallow = self.table.get("mesh_ratio", np.ones(len(self.table["t_mm"]))) < 1
+        read = ("expansion_ratio", "barrier_mm2", "stiffness_mm2", "nu_tangent_ratio")
+        kept = {name: np.where(shallow, np.nan, self.table[name]) for name in read}
+        return _with_sheet({**self.table, **kept}, self.meta, self.hash, self.sheet)
+
     def scaled(self, sheet: Sheet) -> CellLibrary:
         """Return the library for a sheet of the same slit/edge, hinge/edge and ν: lengths and energies only scale."""
         mine, asked = shape_of(self.sheet), shape_of(sheet)

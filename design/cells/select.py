@@ -13,6 +13,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from design.cells.library import CellLibrary
 from design.errors import DesignError, OutOfLibrary
 
 Array = NDArray[np.float64]
@@ -25,7 +26,6 @@ CHUNK_COUNT = 4000  # expansions looked up at a time
 COLUMNS_LIMIT_COUNT = 400  # a library with more distinct angles than this is not a set of columns
 REFINE_COUNT = 33  # finer angles on which the smooth curve is looked for once more, about the coarse one
 REFINE_ROUNDS_COUNT = 4
-REACH_ROWS = 4  # to which the lowest reachable row is found
 JUMP_MM = 0.01  # in t, between two rows: more is a jump (0.02 mm per 0.002 of expansion), where a smooth curve ends
 
 
@@ -92,11 +92,6 @@ class Table:
     t_mm: Array  # (m, c)
     stiffness_mJ: Array  # (m, c)
     barrier_mJ: Array  # (m, c)
-
-    def above(self, low: int) -> Table:
-        """Return the table from row `low` on."""
-        fields = (self.t_mm, self.stiffness_mJ, self.barrier_mJ)
-        return Table(self.expansion_ratio[low:], self.theta_rad, *(field[low:] for field in fields))
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +167,8 @@ def angles_of(library: CellMap) -> Array:
 
 def _densely(library: CellMap, angles_rad: Array | None) -> CellMap:
     """Return the library on dense columns where it can interpolate itself, else as it is."""
+    if isinstance(library, CellLibrary):
+        library = library.firm()
     at = getattr(library, "at", None)
     if at is None:
         return library
@@ -217,9 +214,7 @@ def selection_curve(library: CellMap, options: SelectionOptions = SelectionOptio
 
 
 def curve_of(table: Table, options: SelectionOptions) -> SelectionCurve:
-    """Return the rule's choice over all rows of a table, for `smooth` over those that a smooth curve reaches."""
-    if options.rule == "smooth":
-        table = _reachable(table, options.max_stiffness_loss_frac)
+    """Return the rule's choice over all rows of a table."""
     stiffness = np.where(np.isnan(table.stiffness_mJ), -np.inf, table.stiffness_mJ)
     best = stiffness.max(axis=1)
     if options.rule == "smooth":
@@ -230,30 +225,6 @@ def curve_of(table: Table, options: SelectionOptions) -> SelectionCurve:
     rows = _smooth_rows(values[0]) if options.rule == "smooth" else slice(0, None)
     t, chosen, barrier = (value[rows] for value in values)
     return SelectionCurve(options, table.expansion_ratio[rows], t, theta_rad[rows], chosen, barrier, best[rows], table)
-
-
-def _reachable(table: Table, loss_frac: float) -> Table:
-    """Return the table without its lowest rows, as many as pull the path into a jump further up.
-
-    Near the bistable limit single cells lie far from all others, and a path that must begin at them bends towards
-    them long before. How many rows that are is halved out.
-    """
-
-    def jumps(low: int) -> NDArray[np.int64]:
-        part = table.above(low)
-        t_mm = _along(part, part.t_mm, _smooth_path(part, loss_frac))
-        return low + np.flatnonzero(~(np.abs(np.diff(t_mm)) <= JUMP_MM))
-
-    found = jumps(0)
-    if len(found) == 0 or found[-1] > len(table.t_mm) - 3:
-        return table
-    low, high = 0, int(found[-1]) + 1
-    if len(jumps(high)):
-        return table
-    while high - low > REACH_ROWS:
-        middle = (low + high) // 2
-        low, high = (middle, high) if len(jumps(middle)) else (low, middle)
-    return table.above(high)
 
 
 def _best_column(value: Array) -> NDArray[np.int64]:
