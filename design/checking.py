@@ -16,9 +16,10 @@ from design.findings import Finding
 from design.flatten import FeasibilityReport, Limits, feasibility
 from design.flatten.ladder import Remedy
 from design.pattern.paths import Layer, LayerPreset
-from design.pipeline import Design, Watch, build, cells_on_offer, unwatched
+from design.pipeline import Design, build, cells_on_offer
 from design.spec import DesignSpec
 from design.surface import TriMesh, boundary_loops
+from design.watch import Watch, unwatched
 
 
 @dataclass(frozen=True, slots=True)

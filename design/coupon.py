@@ -29,6 +29,7 @@ from design.pattern.font import Anchor, text_strokes
 from design.pattern.paths import CutPath
 from design.pattern.slits import outline_loops, slit_paths, slits_of
 from design.pattern.tiling import Array, Tiling, lattice
+from design.watch import Watch, unwatched
 
 GAP_MM = 8.0  # between patches with their tags: the sheet holds together while it is cut
 LINE_MM, BETWEEN_MM = 2.6, 1.4  # height of the tag's two lines of text, and what lies between them
@@ -69,6 +70,7 @@ def coupon(
     sheet: Sheet,
     cells_count: tuple[int, int] = (6, 6),
     border: BorderOptions = BORDER,
+    watch: Watch = unwatched,
 ) -> Coupon:
     """Return a sheet of uniform patches, one a hinge width, and what each should do when it is pulled open.
 
@@ -92,7 +94,10 @@ def coupon(
             anchors.append(Anchor(x, y - half, LINE_MM, anchor.width_mm))
     paths += registration_marks(size, border) if border.marks else []
     first = anchors[0] if anchors else None
-    solved = [solve_cell(t_mm, theta_rad, replace(sheet, hinge_mm=hinge)).expansion_ratio for hinge in hinges_mm]
+    solved = []
+    for number, hinge in enumerate(hinges_mm):
+        watch(f"solving the cell with a hinge of {hinge:g} mm", number / len(hinges_mm))
+        solved.append(solve_cell(t_mm, theta_rad, replace(sheet, hinge_mm=hinge)).expansion_ratio)
     gauge_mm = sheet.edge_mm * cells_count[0]
     patches = [Patch(n, h, s, gauge_mm) for n, h, s in zip(names, hinges_mm, solved, strict=True)]
     drawing = Drawing(size, tuple(paths), first, None, tuple(anchors[1:]))

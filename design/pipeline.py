@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -37,6 +37,7 @@ from design.pattern.tubes import period_mm, tile_tube
 from design.predicted import Predicted, predict
 from design.spec import DesignSpec, Region
 from design.surface import TriMesh
+from design.watch import Watch, unwatched
 
 SCALE_ROUNDS_COUNT = 24
 SCALE_MARGIN_RATIO = 2e-4  # kept from the end of the library, so that cells come to lie just inside it
@@ -44,12 +45,6 @@ CONTACT_FRAC = 1e-4  # of the material lying on other material: less is rounding
 HINGE_SAME_MM = 1e-6
 WIDENING_ROUNDS_COUNT, WIDENING_SAME_RATIO = 4, 1e-3  # 1e-3 of expansion moves a hinge by a micrometre
 PUBLISHED_HIGH_RATIO = 1.75  # what the published pipeline scales the greatest expansion to
-
-Watch = Callable[[str, float], None]
-
-
-def unwatched(_: str, __: float) -> None:
-    """Hear nothing."""
 
 
 @dataclass(frozen=True, slots=True)

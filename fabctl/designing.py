@@ -29,6 +29,7 @@ from design.pipeline import Design, build
 from design.spec import DesignSpec, Kind, Rim
 from design.surface import TriMesh
 from design.targets import TARGETS
+from design.watch import Watch
 from fabctl.config.bench import names
 from fabctl.config.coupon import CouponConfig
 from fabctl.config.material import LayerConfig, MaterialConfig, load_material
@@ -37,6 +38,7 @@ from fabctl.errors import RefusedError, UsageError
 from fabctl.events import Emit, Event, silent
 
 WRITING_FROM_FRAC = 0.99  # of a build: what is left is writing the folder
+COUPON_SOLVED_FRAC = 0.9  # the rest is ordering the cut and writing
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,10 +142,13 @@ def inputs_for(
 def design_of(inputs: Inputs, emit: Emit = silent) -> Design:
     """Return the design of the inputs."""
 
-    def watch(message: str, done_frac: float) -> None:
-        emit(Event("progress", message, WRITING_FROM_FRAC * done_frac))
-
+    watch = progress_of(emit, WRITING_FROM_FRAC)
     return build(inputs.spec, inputs.mesh, inputs.library, inputs.presets, watch, inputs.findings)
+
+
+def progress_of(emit: Emit, up_to_frac: float = 1.0) -> Watch:
+    """Return what the design package tells its progress to; its whole is `up_to_frac` of the command's."""
+    return lambda message, done_frac: emit(Event("progress", message, up_to_frac * done_frac))
 
 
 def build_folder(
@@ -251,15 +256,21 @@ def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
     return {layer: LayerPreset(c.power_frac, c.feed_mm_s, c.passes_count) for layer, c in layers.items()}
 
 
-def write_coupon(folder: Path, asked: CouponConfig, home: Path, replace: bool = False) -> tuple[Coupon, Bundle]:
+def write_coupon(
+    folder: Path, asked: CouponConfig, home: Path, replace: bool = False, emit: Emit = silent
+) -> tuple[Coupon, Bundle]:
     """Write a coupon's folder, which is cut as a design's is; return what is drawn, and the folder."""
     material = load_material(asked.material, home)
     presets = presets_of(material)
     assert material.laser is not None
+    refuse_taken(folder, replace)
     sheet = sheet_of(material, material.edge_mm)
+    emit(Event("progress", "choosing the cell", 0.0))
     library = load_library(Path(asked.library) if asked.library else None).scaled(sheet)
     cell = select(library, np.array([asked.expansion_ratio]))
-    made = coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), asked.hinges_mm, sheet)
+    watch = progress_of(emit, COUPON_SOLVED_FRAC)
+    made = coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), asked.hinges_mm, sheet, watch=watch)
+    watch("writing the coupon's folder", 1.0)
     job = compose_job(made.drawing, presets, job_options(asked.tool, material.laser.kerf_mm), remarks=[asked.name])
     text = yaml.safe_dump(asked.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
     return made, write_coupon_bundle(made, job, text, library.hash, sheet.edge_mm, folder, replace)

@@ -98,17 +98,14 @@ def check(
     """
     from design.checking import check as checked
     from design.checking import misfit_png
-    from fabctl.designing import inputs_for
+    from fabctl.designing import inputs_for, progress_of
     from fabctl.errors import DONE, REFUSED
     from fabctl.records.folder import write_atomically
 
     listen = progress()
+    listen(Event("progress", "reading the surface", 0.0))
     inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
-
-    def watch(message: str, done_frac: float) -> None:
-        listen(Event("progress", message, done_frac))
-
-    found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, remedy, watch)
+    found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, remedy, progress_of(listen))
     if picture is not None:
         write_atomically(picture, misfit_png(inputs.mesh, found.report, inputs.spec.name))
     findings = [*inputs.findings, *found.findings]
@@ -120,8 +117,7 @@ def check(
         lines.append(
             f"{step.rung:8} spread {step.spread_ratio:.3f}  {'fits' if step.fits else 'too much'}: {step.detail}"
         )
-    if found.report.proven_infeasible:
-        lines.append(f"proven: no single sheet without cones can spread by less than {found.report.bound_ratio:.3f}")
+    lines += [finding.message for finding in found.report.findings if finding.code == "FIT-PROVEN"]
     if found.design is not None:
         width, height = found.design.drawing.size_mm
         minutes = found.design.job.time_s / 60
@@ -129,6 +125,8 @@ def check(
         lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
+    if found.report.best() is None and remedy == "none":
+        lines.append("--remedy both tries cones, and the nearest surface that fits")
     facts = {"target": target, "fits": fits, **found.as_dict()}
     show(facts, as_json, lines, DONE if fits else REFUSED, f"{target}: no single sheet fits it as it is")
 
@@ -141,10 +139,7 @@ def compare(a: Path, b: Path, as_json: bool) -> None:
     """Compare two design folders: sheet, cells, cutting, deployed shape and stiffness."""
     from design.bundle import open_bundle
     from design.compared import compare as compared
+    from design.compared import compared_lines
 
     found = compared(open_bundle(a), open_bundle(b))
-    lines = [f"{'':24} {a.name:>14} {b.name:>14}   B over A"]
-    for name, ratio in found["b_over_a_ratio"].items():
-        lines.append(f"{name:24} {found['a'][name]:14.5g} {found['b'][name]:14.5g} {ratio:10.3f}")
-    lines.append(f"{found['cells_at_the_same_place_count']} cells lie at the same place in both")
-    show(found, as_json, lines)
+    show(found, as_json, [f"A: {a}", f"B: {b}", *compared_lines(found)])
