@@ -186,10 +186,11 @@ def lay_flat(spec: DesignSpec, mesh: TriMesh, curve: SelectionCurve | None, foun
     """Return the flat of `mesh`, by the first rung of the ladder on which the library's range is enough.
 
     Raises `OutOfLibrary` with what the ladder found where it ends before that. Cones that the specification asks for
-    are placed without climbing, and a flat that is given is taken as it is.
+    are placed without climbing, and a flat or a rim that is given is taken as it is.
     """
     remedy = {"report": "none"}.get(spec.infeasible, spec.infeasible)
-    if curve is None or spec.flatten.cones_count or spec.flatten.given_mm is not None:
+    given = spec.flatten.given_mm is not None or spec.flatten.boundary == "prescribed"
+    if curve is None or spec.flatten.cones_count or given:
         flat = flatten(mesh, spec.flatten)
         found += flat.findings
         return flat

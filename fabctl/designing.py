@@ -21,6 +21,7 @@ from design.coupon import Coupon, coupon
 from design.export.gcode import GcodeOptions
 from design.findings import Finding
 from design.flatten.cut import chain_through
+from design.flatten.prescribed import rim_u_through
 from design.job import JobOptions, compose_job
 from design.meshfiles import read_given_flat, read_mesh
 from design.pattern.paths import Layer, LayerPreset
@@ -87,6 +88,9 @@ def _inputs_of(
         spec = changed(
             spec, flatten=changed(spec.flatten, cut_path=chain_through(mesh, np.array(config.flatten.cut_mm)))
         )
+    if config.flatten.rim_u is not None:
+        rows = np.array(config.flatten.rim_u)
+        spec = changed(spec, flatten=changed(spec.flatten, boundary_u=rim_u_through(mesh, rows[:, :3], rows[:, 3])))
     file = library or library_file(config, beside)
     cells = library_of(config, file).scaled(sheet)
     return Inputs(spec, keeping("library", file, text), mesh, cells, presets, tuple(findings))
