@@ -280,20 +280,17 @@ def scaled_tube(
 ) -> tuple[Flattening, Tiling, Array]:
     """Return a tube's flat at the scale nearest to the wanted end at which a whole number of cells goes around."""
     low, high = limits_ratio
-    fitting = []
-    for count, scale in flat.whole_cell_scales(spec.cell_mm, 0.8, 1.25):
+    scales = flat.whole_cell_scales(spec.cell_mm, 0.8, 1.25)
+    for count, scale in sorted(scales, key=lambda item: abs(np.log(item[1]))):
         scaled_flat = flat.scaled(scale)
         tiling = tile_tube(scaled_flat, spec.cell_mm)
         points, faces, copy = scaled_flat.unrolled()
         area_ratio = scaled_flat.expansion_ratio[copy] ** 2
         wanted = averaged(tiling, points, faces, area_ratio, spec.averaging)
         if low <= wanted.min() and wanted.max() <= high:
-            fitting.append((abs(np.log(scale)), count, scaled_flat, tiling, wanted))
-    if not fitting:
-        raise OutOfLibrary(*_faces_range(flat), limits_ratio, found)
-    _, count, flat, tiling, wanted = min(fitting, key=lambda item: item[0])
-    found.append(Finding("TUBE-CELLS", f"{count} cells go around; the seam joins cell to cell", "info"))
-    return flat, tiling, wanted
+            found.append(Finding("TUBE-CELLS", f"{count} cells go around; the seam joins cell to cell", "info"))
+            return scaled_flat, tiling, wanted
+    raise OutOfLibrary(*_faces_range(flat), limits_ratio, found)
 
 
 def _faces_range(flat: Flattening) -> tuple[float, float]:

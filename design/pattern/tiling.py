@@ -151,7 +151,14 @@ def _well_held(cells: Index, vertices_count: int) -> NDArray[np.bool_]:
 
 def region_of(flat_mm: Array, faces: Index) -> shapely.Geometry:
     """Return the flat's area as polygons with their holes; its faces must not overlap."""
-    region = shapely.coverage_union_all(shapely.polygons(flat_mm[faces]))
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = (faces[:, :2].ravel(), faces[:, 1:].ravel())
+    pieces = connected_components(coo_array((np.ones(len(ends[0])), ends), shape=2 * (len(flat_mm),)))[1][faces[:, 0]]
+    # Within a piece faces share their corners exactly; copies of a tube's meet along sides that were computed twice.
+    parts = [shapely.coverage_union_all(shapely.polygons(flat_mm[faces[pieces == k]])) for k in np.unique(pieces)]
+    region = shapely.union_all(parts)
     shapely.prepare(region)
     return region
 
