@@ -133,6 +133,10 @@ def inputs_for(
         return read_inputs(target, home, None, cell_mm, library)
     if is_spec and target not in TARGETS:
         raise UsageError(f"{target}: a specification says its material and cells itself; change them there")
+    if target not in TARGETS and not Path(target).is_file():
+        wrong = "is a folder" if Path(target).is_dir() else "there is no such file"
+        specs, surfaces = ", ".join(names("specs", home)) or "none", ", ".join(sorted(TARGETS))
+        raise UsageError(f"{target}: {wrong}, no specification ({specs}) and no surface of our own ({surfaces})")
     source: str | MadeTarget = MadeTarget(make=target) if target in TARGETS else target
     config = SpecConfig(
         name=re.sub(r"\W", "-", Path(target).stem) or "target",
