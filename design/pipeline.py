@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,7 @@ from design.compensated import compensated
 from design.deploy.supports import Support
 from design.errors import OutOfLibrary
 from design.findings import Finding
-from design.flatten import Flattening, Limits, feasibility, flatten
-from design.flatten.ladder import Remedy
+from design.flatten import FeasibilityReport, Flattening, Limits, feasibility, flatten
 from design.hinged import Widening, as_cut, hinge_of, hinge_range, hinged, widening
 from design.job import Job, JobOptions, compose_job
 from design.limits import check_count
@@ -98,17 +96,18 @@ def build(
     presets: Mapping[Layer, LayerPreset],
     watch: Watch = unwatched,
     findings: Iterable[Finding] = (),
+    report: FeasibilityReport | None = None,
 ) -> Design:
     """Return the design of `mesh`; raise a `DesignError` that carries the findings where there is none.
 
     `library` must be that of the sheet to cut, with cells of `spec.cell_mm`; `presets` say how each layer is cut;
-    `findings` are those of reading the inputs.
+    `findings` are those of reading the inputs, `report` is the ladder where it was climbed before.
     """
     watch("flattening the surface", 0.0)
     found = list(findings)
     base, library, curve, wide = cells_on_offer(spec, library)
     found += hinge_range(base, library)
-    flat = lay_flat(spec, mesh, curve, found)
+    flat = lay_flat(spec, mesh, curve, found, report)
     watch("choosing cells", 0.2)
     flat, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)
     if spec.compensate:
@@ -182,20 +181,25 @@ def contact_findings(spec: DesignSpec, choice: Choice, library: CellLibrary) -> 
     return [Finding("CELLS-CONTACT", f"{text}; they will close less than predicted", "warning")]
 
 
-def lay_flat(spec: DesignSpec, mesh: TriMesh, curve: SelectionCurve | None, found: list[Finding]) -> Flattening:
+def lay_flat(
+    spec: DesignSpec,
+    mesh: TriMesh,
+    curve: SelectionCurve | None,
+    found: list[Finding],
+    report: FeasibilityReport | None = None,
+) -> Flattening:
     """Return the flat of `mesh`, by the first rung of the ladder on which the library's range is enough.
 
     Raises `OutOfLibrary` with what the ladder found where it ends before that. Cones that the specification asks for
     are placed without climbing, and a flat or a rim that is given is taken as it is.
     """
-    remedy = {"report": "none"}.get(spec.infeasible, spec.infeasible)
     given = spec.flatten.given_mm is not None or spec.flatten.boundary == "prescribed"
     if curve is None or spec.flatten.cones_count or given:
         flat = flatten(mesh, spec.flatten)
         found += flat.findings
         return flat
     low, high = curve.range_ratio()
-    report = feasibility(mesh, Limits(low, high, spec.cell_mm), spec.flatten, cast(Remedy, remedy))
+    report = report or feasibility(mesh, Limits(low, high, spec.cell_mm), spec.flatten, spec.remedy())
     flat = report.flattening()
     found += [finding for finding in report.findings if finding not in found]
     found += [finding for finding in flat.findings if finding not in found]

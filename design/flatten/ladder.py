@@ -136,7 +136,8 @@ def feasibility(
     found = [*_verdict(steps, limits), *_where(mesh, excess_log), _proof_finding(bound_ratio, proven, limits, is_tube)]
     if remedy in ("cones", "both"):
         steps += _try_cones(mesh, limits, asked, emit, found)
-    near = _try_nearest(mesh, limits, asked, emit, found) if remedy in ("nearest", "both") else None
+    seam = replace(asked, seam="tube") if is_tube else asked  # decided: not to be tried as a disk at every stage
+    near = _try_nearest(mesh, limits, seam, emit, found) if remedy in ("nearest", "both") else None
     if near is not None:
         detail = f"the surface was moved by {near.rms_mm:.2f} mm RMS ({near.rms_ratio:.2%} of its diagonal)"
         steps.append(_step("nearest", near.flattening, limits, detail))

@@ -77,8 +77,8 @@ def build(
 @library_option
 @click.option("--cells", type=click.Choice(["expanding", "contracting"]),
               help="Kind of cells, for a mesh or surface [expanding].")  # fmt: skip
-@click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]), default="none", show_default=True,
-              help="What to try where no single sheet fits.")  # fmt: skip
+@click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]),
+              help="What to try where no single sheet fits [the specification's, or none].")  # fmt: skip
 @click.option("--picture", type=PictureFile((".png",)), help="PNG of where the surface does not fit.")
 @json_option
 def check(
@@ -87,7 +87,7 @@ def check(
     cell_mm: float | None,
     library: Path | None,
     cells: str | None,
-    remedy: str,
+    remedy: str | None,
     picture: Path | None,
     as_json: bool,
 ) -> None:
@@ -105,7 +105,7 @@ def check(
     listen = progress()
     listen(Event("progress", "reading the surface", 0.0))
     inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
-    found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, remedy, progress_of(listen))
+    found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, cast(Any, remedy), progress_of(listen))
     if picture is not None:
         write_atomically(picture, misfit_png(inputs.mesh, found.report, inputs.spec.name))
     findings = [*inputs.findings, *found.findings]
@@ -125,7 +125,7 @@ def check(
         lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
-    if found.report.best() is None and remedy == "none":
+    if found.report.best() is None and (remedy or inputs.spec.remedy()) == "none":
         lines.append("--remedy both tries cones, and the nearest surface that fits")
     facts = {"target": target, "fits": fits, **found.as_dict()}
     show(facts, as_json, lines, DONE if fits else REFUSED, f"{target}: no single sheet fits it as it is")

@@ -160,3 +160,16 @@ def test_a_proof_that_cannot_be_computed_leaves_the_rest_of_the_report(monkeypat
     report = feasibility(hemisphere(edge_mm=12), PAPER)
     assert report.bound_ratio is None and not report.proven_infeasible
     assert "FIT-UNPROVEN" in {finding.code for finding in report.findings}
+
+
+def test_what_is_laid_flat_as_a_tube_is_searched_near_as_a_tube(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[FlattenOptions] = []
+
+    def listens(_mesh: TriMesh, _limit: float, options: FlattenOptions, _emit: object) -> None:
+        asked.append(options)
+        raise NotConverged("the search for a feasible surface", 1.0, 40)
+
+    monkeypatch.setattr("design.flatten.ladder.closest_feasible", listens)
+    feasibility(wavy_tube(), Limits(1.158, 1.775), remedy="nearest")
+    feasibility(hemisphere(edge_mm=12), PAPER, remedy="nearest")
+    assert [options.seam for options in asked] == ["tube", "auto"]
