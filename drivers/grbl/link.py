@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from drivers.clock import Clock
 from drivers.errors import DeviceAlarm, DeviceRefused, DeviceTimeout
@@ -26,7 +27,8 @@ def alarm(code: int, firmware: str = "grbl") -> DeviceAlarm:
 class Link:
     """Messages over a transport, their lengths in mm. The last report is kept as `report`, with its machine place.
 
-    `unit_mm` is what the board counts in (`$13`), `offset_mm` its work offset: known once identified.
+    `unit_mm` is what the board counts in (`$13`), `offset_mm` its work offset: known once identified. Overrides are
+    told in every few reports and whenever they change: the others carry the last ones.
     """
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
@@ -37,6 +39,7 @@ class Link:
         self.garbled: list[str] = []
         self.unit_mm = 1.0
         self.offset_mm: Vector | None = None
+        self.overrides: tuple[int, int, int] | None = None
         self.firmware = "grbl"  # whose numbers `error:` and `ALARM:` are; known once identified
 
     def send(self, data: bytes) -> None:
@@ -50,6 +53,8 @@ class Link:
         for message in found:
             if isinstance(message, Report):
                 self.report, self.reported_s = message, self.clock.now_s()
+            elif isinstance(message, Banner):
+                self.overrides = None
             elif isinstance(message, Garbled):
                 self.garbled.append(message.text)
         return found
@@ -59,6 +64,8 @@ class Link:
             report = report.scaled(self.unit_mm)
         if report.offset_mm is not None:
             self.offset_mm = report.offset_mm
+        self.overrides = report.overrides or self.overrides
+        report = replace(report, overrides=self.overrides)
         return report.placed(self.offset_mm) if self.offset_mm is not None else report
 
     def drain(self) -> None:
