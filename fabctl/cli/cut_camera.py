@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -11,9 +11,13 @@ from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab,
 from fabctl.cli.paths import config_names
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from fabctl.bench import Bench
     from fabctl.cut.by_camera import BedEye
     from fabctl.cut.job import CutDone, CutOrder
+
+FC = TypeVar("FC", bound="Callable[..., Any] | click.Command")
 
 
 def eye_of(
@@ -59,32 +63,40 @@ def _is_registration(path: Path) -> bool:
     return isinstance(data, dict) and "sheet" in data
 
 
+def plain_options(what: str) -> Callable[[FC], FC]:
+    """Return the options of a job for `plain_job`, which cuts `what`."""
+    place = f"Where the {what}'s corner lies: in the corner of the travel, or where the head is."
+    options = (
+        click.option("--origin", type=click.Choice(["home", "here"]), default="home", show_default=True, help=place),
+        click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves."),
+        bench_option,
+        yes_option,
+        json_option,
+    )
+
+    def add(command: FC) -> FC:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
 @click.command("marks")
 @click.argument("board", type=config_names("boards"))
 @click.option(
     "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives power and speed."
 )
-@click.option(
-    "--origin",
-    type=click.Choice(["home", "here"]),
-    default="home",
-    show_default=True,
-    help="Where the board's corner lies: in the corner of the travel, or where the head is.",
-)
-@click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
-@bench_option
-@yes_option
-@json_option
+@plain_options("board")
 def marks_command(
     board: str, material: str, origin: str, dry_run: bool, bench_name: str, yes: bool, as_json: bool
 ) -> None:
     """Engrave the marks of BOARD: on a scrap for the bed's alignment, or on a sheet for print and cut."""
     from design.export.gcode import GcodeOptions, gcode
-    from design.pattern.paths import LayerPreset
     from fabctl.config.bench import find, load_bench
     from fabctl.config.boards import load_board
     from fabctl.config.material import load_material
-    from fabctl.cut.compose import PITCH_SPOTS
+    from fabctl.cut.compose import PITCH_SPOTS, presets_of
     from fabctl.cut.job import CutOrder, laser_config_of
     from fabctl.vision.boards import hatch, sheet_ink
 
@@ -94,9 +106,7 @@ def marks_command(
     strokes = hatch(sheet_ink(sheet), PITCH_SPOTS * spot_mm, spot_mm)
 
     def compose(_: str, s_max_count: float) -> tuple[str, ...]:
-        layer = stuff.laser.engrave if stuff.laser is not None else None
-        preset = LayerPreset(layer.power_frac, layer.feed_mm_s) if layer is not None else LayerPreset(0.0, 1.0)
-        return gcode(strokes, {"engrave": preset}, GcodeOptions(s_max_count=s_max_count))
+        return gcode(strokes, presets_of(stuff), GcodeOptions(s_max_count=s_max_count))
 
     order = CutOrder(find("boards", board, home.root), compose, stuff, origin=origin, kind="marks")  # type: ignore[arg-type]  # click.Choice has checked it
     done = plain_job(order, bench_name, f"marks {sheet.name}", yes, dry_run)
@@ -108,7 +118,7 @@ def marks_command(
 
 
 def plain_job(order: CutOrder, bench_name: str, purpose: str, yes: bool, dry_run: bool = False) -> CutDone:
-    """Run a job that makes no specimen: the same checks, the same question, the same record."""
+    """Run a job that is no design: the same checks, the same question, the same record."""
     from fabctl.bench import open_bench
     from fabctl.config.bench import load_bench
     from fabctl.cut.job import Desk, cut
