@@ -33,6 +33,7 @@ ROW_MM = 11.0
 GAP_MM = 3.0
 MODULE_MM = 0.75  # of the id's code
 TEXT_MM = 3.0
+MOST_FEED_MM_S, MOST_PASSES_COUNT = 10_000.0, 100
 HEADER_LINES = 5  # G21 G90 G94 G17 M4S0: modal words, once
 
 
@@ -173,6 +174,9 @@ def coupon_from(data: dict[str, object], where: str) -> Coupon:
         powers, feed, passes = data["powers_frac"], data["feed_mm_s"], data["passes_count"]
         if not isinstance(powers, list) or not isinstance(feed, int | float) or not isinstance(passes, int):
             raise ValueError("powers_frac must be a list, feed_mm_s a number, passes_count a whole number")
+        if not (0 < feed < MOST_FEED_MM_S and 0 < passes <= MOST_PASSES_COUNT):
+            limits = f"feed_mm_s up to {MOST_FEED_MM_S:g}, passes_count up to {MOST_PASSES_COUNT}"
+            raise ValueError(f"{limits}, both above zero, not {feed:g} and {passes}")
         return make_coupon([float(p) for p in powers], float(feed), passes)
     except (KeyError, TypeError, ValueError) as fault:
         raise UsageError(f"{where}: not a coupon: {why_not(fault)}") from fault

@@ -166,6 +166,8 @@ def test_a_knocked_camera_is_noticed(alignment: Alignment, bed_picture: Picture)
 def test_an_old_alignment_is_refused(alignment: Alignment, bed_picture: Picture) -> None:
     now = datetime.fromisoformat(WHEN) + timedelta(days=31)
     assert [f.code for f in drift_findings(bed_picture, "bed", alignment, now)] == ["ALIGN-OLD"]
+    before = datetime.fromisoformat(WHEN) - timedelta(days=2)  # a clock that was wrong tells no age
+    assert [f.code for f in drift_findings(bed_picture, "bed", alignment, before)] == ["ALIGN-OLD"]
 
 
 def test_another_board_is_not_taken_for_ours(board_pictures: list[Picture]) -> None:

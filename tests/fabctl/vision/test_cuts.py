@@ -118,6 +118,9 @@ def test_the_coupons_program_cuts_every_slit_at_its_power() -> None:
     assert coupons.coupon_from(coupons.coupon_data(COUPON), "here") == COUPON
     with pytest.raises(UsageError, match="powers_frac"):
         coupons.coupon_from({**coupons.coupon_data(COUPON), "powers_frac": "many"}, "here")
+    for change in ({"feed_mm_s": math.nan}, {"passes_count": 0}, {"format": 1}):
+        with pytest.raises(UsageError, match="here"):
+            coupons.coupon_from({**coupons.coupon_data(COUPON), **change}, "here")
 
 
 @pytest.mark.parametrize("blur_px", [0.5, 1.0, 2.0])
