@@ -220,4 +220,8 @@ def test_the_job_is_drawn_where_it_will_be_cut(alignment: Alignment, bed_picture
     at = np.rint(alignment.to_pixels(np.array([[165.0, 90.0]]), 2.3)[0]).astype(int)
     patch = drawn[at[1] - 1 : at[1] + 2, at[0] - 1 : at[0] + 2].astype(int)
     assert (patch[..., 2] - patch[..., 0]).max() > 80
-    assert error_map(bed_picture, alignment).shape == (*bed_picture.shape, 3)
+    drawn = error_map(bed_picture, alignment)
+    h, w = bed_picture.shape
+    assert drawn.shape[1:] == (w, 3)
+    assert drawn.shape[0] > h  # a legend under it
+    assert (drawn[:h, -2:, 2].astype(int) - drawn[:h, -2:, 0] < 100).all()  # no label runs out of the picture
