@@ -44,7 +44,7 @@ class Workspace:
         return path
 
     def new_specimen(self, design: Path) -> Specimen:
-        """Give out the next id, with a copy of the design folder; safe against two cuts at once."""
+        """Give out the next id, with a copy of the design (a folder, or one file); safe against two cuts at once."""
         self.specimens.mkdir(parents=True, exist_ok=True)
         taken = [int(p.name[2:]) for p in self.specimens.iterdir() if SPECIMEN.fullmatch(p.name)]
         number = max(taken, default=0) + 1
@@ -56,7 +56,11 @@ class Workspace:
             except FileExistsError:
                 number += 1
         try:
-            shutil.copytree(design, path / "design")
+            if design.is_dir():
+                shutil.copytree(design, path / "design")
+            else:
+                (path / "design").mkdir()
+                shutil.copy(design, path / "design")
         except (OSError, shutil.Error) as fault:
             raise RecordError(f"{path}: the design cannot be copied: {fault}") from fault
         body = {"id": path.name, "made_utc": datetime.now(UTC).isoformat(), "design": str(design.resolve())}

@@ -67,7 +67,7 @@ class Eye(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CutOrder:
-    """What is to be cut, how, and where; `kind` other than "cut" (marks, a coupon) makes no specimen."""
+    """What is to be cut, how, and where; of the kinds cut, kerf and marks only marks make no specimen."""
 
     design: Path
     compose: Compose
@@ -249,7 +249,7 @@ def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: L
     with kept(lab, bench, order):
         if order.eye is not None:
             order.eye.look_again()
-        specimen = lab.new_specimen(order.design) if order.kind == "cut" else None
+        specimen = lab.new_specimen(order.design) if order.kind != "marks" else None
         plan = _plan(laser, bench, order, specimen.name if specimen is not None else SAMPLE_ID)
         _refuse(plan.findings)
     facts = {
@@ -273,7 +273,7 @@ def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: L
             tell(Event("stage", "homing"))
             laser.home()
         result = execute(laser, plan, order, laser_config(bench), Desk(desk.ask, tell, desk.keys), run)
-    if specimen is not None:
+    if specimen is not None and order.kind == "cut":
         bench.lay(specimen.design)
     return CutDone(plan, specimen, run, result)
 
