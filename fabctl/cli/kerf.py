@@ -103,7 +103,7 @@ def cut_coupon(folder: Path, origin: str, dry_run: bool, bench_name: str, yes: b
     def compose(_: str, s_max_count: float) -> tuple[str, ...]:
         return coupon_gcode(made, engrave, spot_mm, GcodeOptions(s_max_count=s_max_count))
 
-    order = CutOrder(file, compose, stuff, origin=origin, kind="coupon")  # type: ignore[arg-type]  # click.Choice has checked it
+    order = CutOrder(file, compose, stuff, origin=origin, kind="kerf-coupon")  # type: ignore[arg-type]  # click.Choice has checked it
     done = plain_job(order, bench_name, f"coupon {folder.name}", yes, dry_run)
     facts = {"coupon": str(file), "run": done.run.run_id if done.run else None, **done.result}
     if done.run is None:

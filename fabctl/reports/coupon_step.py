@@ -48,7 +48,7 @@ def coupon_verdict(run: RunFolder | None, cut: RunFolder | None) -> tuple[Word, 
         unread = ["coupon: its form is not read yet (fabctl design coupon-read)"] if run is None else []
         return "incomplete", "Not every step has a result.", missing + unread
     result = run.result() or {}
-    off = [patch for patch in result["patches"] if patch["agrees"] is False]
+    off = [patch for patch in result["patches"] if not patch["agrees"]]
     reasons = [
         f"patch {p['patch']}, hinge {p['hinge_mm']:.3f} mm: {p['off_ratio']:+.4f} off the map, more than its "
         f"uncertainty of {p['uncertainty_ratio']:.4f}"

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from fabctl.coupon import KIND as READING
 from fabctl.records.folder import RunFolder, sha256, status_of
 from fabctl.reports.coupon_step import coupon_step, coupon_verdict, is_coupon
 from fabctl.reports.design_step import cut_step, design_step
@@ -26,9 +27,9 @@ def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
     steps += [cut_step(latest["cut"])] if "cut" in latest else []
     steps += [indent_step(latest["indent"], specimen.design)] if "indent" in latest else []
     steps += [scan_step(latest["scan"])] if "scan" in latest else []
-    steps += [coupon_step(latest["coupon"])] if "coupon" in latest else []
+    steps += [coupon_step(latest[READING])] if READING in latest else []
     if is_coupon(specimen.design):
-        word, sentence, reasons = coupon_verdict(latest.get("coupon"), latest.get("cut"))
+        word, sentence, reasons = coupon_verdict(latest.get(READING), latest.get("cut"))
     else:
         word, sentence, reasons = verdict(latest)
     if made_up := simulated(latest):
