@@ -9,6 +9,7 @@ import click
 
 from fabctl.cli.common import MATERIAL, json_option, lab, progress, say, show
 from fabctl.cli.design_coupon import coupon, coupon_read, library_option
+from fabctl.cli.library_parts import CURVE_WHY
 from fabctl.cli.paths import TARGET, InFile, InFolder, OutFolder, PictureFile, config_names
 from fabctl.events import Event
 
@@ -116,6 +117,9 @@ def check(
         say(str(finding))
     low, high = found.report.limits.low_ratio, found.report.limits.high_ratio
     lines = [f"{found.topology}; the library has {low:.3f} to {high:.3f}, a spread of {high / low:.3f}"]
+    least, greatest = inputs.library.range_ratio()
+    if (f"{least:.3f}", f"{greatest:.3f}") != (f"{low:.3f}", f"{high:.3f}"):
+        lines[0] += f" (all its cells {least:.3f} to {greatest:.3f}: {CURVE_WHY})"
     for step in found.report.steps:
         lines.append(
             f"{step.rung:8} spread {step.spread_ratio:.3f}  {'fits' if step.fits else 'too much'}: {step.detail}"

@@ -101,7 +101,8 @@ import sys
 from distributed import LocalCluster
 
 if __name__ == "__main__":
-    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, local_directory=".") as cluster:
+    quiet = {"dashboard_address": None, "local_directory": "."}
+    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", **quiet) as cluster:
         print(cluster.scheduler_address, flush=True)
         sys.stdin.read()
 """
