@@ -58,7 +58,7 @@ def build(
         f"{bundle.path}: {numbers['cells_count']} cells on {width:.0f} × {height:.0f} mm",
         f"expansion {numbers['expansion_low_ratio']:.3f} to {numbers['expansion_high_ratio']:.3f}",
         f"cut {numbers['cut_mm'] / 1000:.2f} m, travel {numbers['travel_mm'] / 1000:.2f} m, "
-        f"about {numbers['cut_time_s'] / 60:.1f} min",
+        f"about {numbers['cut_time_s'] / 60:.1f} min without the specimen's id",
     ]
     if "deviation_mean_mm" in numbers:
         lines.append(
@@ -130,7 +130,7 @@ def check(
         width, height = found.design.drawing.size_mm
         minutes = found.design.job.time_s / 60
         count = len(found.design.cells.wanted_ratio)
-        lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
+        lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut, without its id")
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
     facts = {"target": target, "fits": fits, **found.as_dict()}

@@ -10,6 +10,7 @@ from typing import Any
 
 from fabctl.coupon import KIND as READING
 from fabctl.records.folder import RunFolder, sha256, status_of
+from fabctl.records.words import is_simulated
 from fabctl.reports.coupon_step import coupon_step, coupon_verdict, is_coupon
 from fabctl.reports.design_step import cut_step, design_step
 from fabctl.reports.indent_step import indent_step
@@ -91,14 +92,7 @@ def verdict(latest: dict[str, RunFolder]) -> tuple[Word, str, list[str]]:
 
 def simulated(latest: dict[str, RunFolder]) -> list[str]:
     """Return the kinds whose telling run was made on a simulated bench, in the order of the work."""
-    return [kind for kind in ("cut", "indent", "scan") if kind in latest and _on_simulators(latest[kind])]
-
-
-def _on_simulators(run: RunFolder) -> bool:
-    config = run.manifest().get("config", {})
-    bench = config.get("bench")
-    listed = isinstance(bench, dict) and (bench.get("simulated") or bench.get("simulators"))
-    return bool(config.get("simulated") or listed)
+    return [kind for kind in ("cut", "indent", "scan") if kind in latest and is_simulated(latest[kind].manifest())]
 
 
 def _keys(steps: Sequence[Step], latest: dict[str, RunFolder]) -> Iterator[Fact]:
