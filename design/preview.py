@@ -14,7 +14,7 @@ from design.pattern.paths import LAYERS, CutPath
 from design.pattern.tiling import Array
 from design.pipeline import Design
 
-WIDTH_INCHES, DPI = 10.0, 150
+WIDTH_INCHES, DPI = 7.5, 200  # a report shows it at half a page: letters must stay legible
 TICKS_COUNT = 5  # intervals along the longest axis of a picture in space
 
 

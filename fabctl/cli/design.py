@@ -130,7 +130,9 @@ def check(
         width, height = found.design.drawing.size_mm
         minutes = found.design.job.time_s / 60
         count = len(found.design.cells.wanted_ratio)
-        lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut, without its id")
+        lines.append(
+            f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut, without its id"
+        )
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
     facts = {"target": target, "fits": fits, **found.as_dict()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +87,12 @@ def _rows(runs: Path, path: Path) -> list[Row]:
             told = (row.kind, row.specimen, row.started_utc, row.status, row.message, row.operator, row.simulated)
             base.execute("insert or replace into listed values (?, ?, ?, ?, ?, ?, ?, ?, ?)", (row.run, stamp, *told))
         query = "select run, kind, specimen, started_utc, status, message, operator, simulated from listed order by run"
-        return [Row(*found, None if flag is None else bool(flag)) for *found, flag in base.execute(query)]
+        return [replace(row, simulated=_flag(row.simulated)) for row in (Row(*found) for found in base.execute(query))]
+
+
+def _flag(stored: int | None) -> bool | None:
+    """Return what SQLite keeps as a number."""
+    return None if stored is None else bool(stored)
 
 
 def _read(folder: Path) -> Row:
