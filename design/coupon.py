@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -87,10 +87,12 @@ def coupon(
     sheet: Sheet,
     cells_count: tuple[int, int] = (6, 6),
     border: BorderOptions = BORDER,
+    watch: Callable[[str, float], None] = lambda _message, _done_frac: None,
 ) -> Coupon:
     """Return a sheet of uniform patches, one a hinge width, and what each should do when it is pulled open.
 
-    Each patch is `cells_count` edges wide and rows high. Every hinge is solved by finite elements, not looked up.
+    Each patch is `cells_count` edges wide and rows high. Every hinge is solved by finite elements, not looked up;
+    `watch` hears which, and how much is done.
     Raises `DesignError` where a hinge leaves no slit.
     """
     _check(hinges_mm, t_mm, theta_rad, sheet)
@@ -110,7 +112,11 @@ def coupon(
             anchors.append(Anchor(x, y - half, LINE_MM, anchor.width_mm))
     paths += registration_marks(size, border) if border.marks else []
     first = anchors[0] if anchors else None
-    solved = [solve_cell(t_mm, theta_rad, replace(sheet, hinge_mm=hinge)).expansion_ratio for hinge in hinges_mm]
+    solved = []
+    for k, hinge in enumerate(hinges_mm):
+        watch(f"solving a cell with hinges of {hinge:g} mm", k / len(hinges_mm))
+        solved.append(solve_cell(t_mm, theta_rad, replace(sheet, hinge_mm=hinge)).expansion_ratio)
+    watch("writing the folder", 1.0)
     gauge_mm = sheet.edge_mm * cells_count[0]
     patches = [
         Patch(name, hinge, expansion, gauge_mm, _notches_mm(tiling, gauge_mm))

@@ -79,6 +79,7 @@ def command(
     if by_unit and parts > 1:
         raise click.UsageError("--cascade opens whole units: leave --parts out")
     emit = progress()
+    emit(Event("stage", f"reading {design}"))
     laid = read_laid(design, lab().root)
     laid = divided(laid, parts) if parts > 1 else laid
     emit(Event("stage", f"deploying {len(laid.layout.cells)} units"))
@@ -97,6 +98,7 @@ def command(
     if by_unit:
         facts["cascade"] = _cascade(laid, folder, popped, animation, emit)
     facts["folder"] = str(folder)
+    emit(Event("stage", f"drawing {'picture and animation' if animation else 'the picture'} into {folder}"))
     _write(folder, laid, popped, settled, animation, facts)
     show(facts, as_json, _lines(facts))
 

@@ -104,6 +104,7 @@ def check(
     from fabctl.records.folder import write_atomically
 
     listen = progress()
+    listen(Event("stage", f"reading {target} and the library of cells"))
     inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
 
     def watch(message: str, done_frac: float) -> None:
@@ -148,6 +149,7 @@ def compare(a: Path, b: Path, as_json: bool) -> None:
     from design.bundle import open_bundle
     from design.compared import compare as compared
 
+    say(f"reading {a} and {b}")
     found = compared(open_bundle(a), open_bundle(b))
     lines = [f"{'':24} {a.name:>14} {b.name:>14}   B over A"]
     for name, ratio in found["b_over_a_ratio"].items():

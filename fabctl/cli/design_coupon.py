@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, json_option, lab, show
+from fabctl.cli.common import MATERIAL, json_option, lab, progress, show
 from fabctl.cli.finite import numbers
 from fabctl.cli.paths import SPECIMEN, SPECIMEN_OR_FILE, InFile, OutFolder
 from fabctl.errors import DONE, OUT_OF_TOLERANCE
@@ -52,7 +52,7 @@ def coupon(
         raise click.UsageError("--hinges-mm takes widths from 0.01 to 10 mm")
     chosen_from = None if library is None else str(library.resolve())
     asked = CouponConfig(material=material, expansion_ratio=expansion_ratio, hinges_mm=hinges, library=chosen_from)
-    made, bundle = write_coupon(output, asked, lab().root, replace)
+    made, bundle = write_coupon(output, asked, lab().root, replace, progress())
     width, height = made.drawing.size_mm
     lines = [f"{output}: {len(made.patches)} patches on {width:.0f} × {height:.0f} mm"]
     for patch in made.patches:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from fabctl.cli.common import json_option, progress, show
+from fabctl.cli.common import json_option, progress, say, show
 from fabctl.cli.library_build import build
 from fabctl.cli.library_parts import (
     file_option,
@@ -74,6 +74,7 @@ def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output:
     library = load_library(file)
     if (t_mm is None) != (theta_deg is None):
         raise click.UsageError("give both --t-mm and --theta-deg, or neither")
+    say(f"drawing {output}" if t_mm is None else f"solving the cell and its stretch, for {output}")
     if t_mm is None or theta_deg is None:
         pictures.save(pictures.maps(library), output)
     else:
@@ -113,6 +114,7 @@ def cell_command(t_mm: float, theta_deg: float, material: str, output: Path | No
     from fabctl.reports import cells as pictures
 
     sheet, theta = sheet_named(material), math.radians(theta_deg)
+    say("solving the cell")
     cell = solve_cell(t_mm, theta, sheet)
     numbers = _numbers(cell, sheet)
     numbers["slits_mm"] = None if cell.verdict == "invalid" else cell_slits(t_mm, theta, sheet).tolist()
@@ -120,6 +122,7 @@ def cell_command(t_mm: float, theta_deg: float, material: str, output: Path | No
     if cell.verdict != "bistable":
         raise SystemExit(REFUSED)
     if output is not None:
+        say(f"drawing its states into {output}")
         found = cell_states(t_mm, theta, sheet)
         if isinstance(found, Failure):
             _refuse(t_mm, theta_deg, found)

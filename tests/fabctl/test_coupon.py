@@ -16,7 +16,8 @@ from fabctl.coupon import open_coupon, read_form
 from fabctl.cut.compose import composer, open_design, sheet_of
 from fabctl.cut.program import read_program
 from fabctl.designing import write_coupon
-from fabctl.errors import RefusedError, UsageError
+from fabctl.errors import BundleError, RefusedError, UsageError
+from fabctl.events import Event
 from fabctl.records.folder import start_run
 from fabctl.reports.page import render
 from fabctl.reports.specimen import specimen_report
@@ -84,6 +85,16 @@ def fill(specimen: Specimen, shift_mm: float, only: str = "AB") -> Path:
         filled += [f"{name},{hinge},{expected},{flat},{length:.2f},50,"] if name in only else []
     path.write_text("\n".join([*head, *filled]) + "\n")
     return path
+
+
+def test_every_hinge_that_is_solved_is_told(lab: Workspace) -> None:
+    heard: list[Event] = []
+    write_coupon(lab.root / "told", CouponConfig(hinges_mm=(0.25, 0.4)), ROOT, emit=heard.append)
+    assert [event.done_frac for event in heard] == [0.0, 0.5, 1.0]
+    assert "0.25 mm" in heard[0].message and "0.4 mm" in heard[1].message
+    with pytest.raises(BundleError, match="exists already"):  # and a taken folder is refused before any of it
+        write_coupon(lab.root / "told", CouponConfig(hinges_mm=(0.25, 0.4)), ROOT, emit=heard.append)
+    assert len(heard) == 3
 
 
 def test_a_coupon_is_composed_for_its_own_sheet_with_the_id_on_every_patch(specimen: Specimen) -> None:
