@@ -14,6 +14,7 @@ from typing import Any
 
 from design.bundle import Bundle, open_bundle
 from design.coupon import FORM, PatchAsCut, patches_as_cut
+from design.errors import NoBundle
 from design.findings import Finding
 from fabctl.errors import RefusedError, UnreadableInput
 from fabctl.files import text_of
@@ -50,7 +51,12 @@ class Measured:
 
 def open_coupon(folder: Path) -> dict[str, PatchAsCut]:
     """Return what was cut, from the `cells.csv` of a coupon's folder; raise `RefusedError` where it is none."""
-    found = open_bundle(folder)
+    try:
+        found = open_bundle(folder)
+    except NoBundle as fault:
+        hint = "leave it in the coupon's folder, or say whose it is with --specimen"
+        told = Finding("COUPON-ALONE", "holds no coupon, so what was cut is not known", where=str(folder), hint=hint)
+        raise UnreadableInput("the form cannot be read there", [told]) from fault
     if found.kind != "coupon":
         told = Finding("COUPON-SPECIMEN", "was cut from a design, not from a coupon", where=str(folder))
         raise RefusedError("a coupon's form cannot be read there", [told])

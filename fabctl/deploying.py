@@ -55,6 +55,9 @@ class Laid:
 def read_laid(folder: Path, home: Path) -> Laid:
     """Return the shell of a design folder; raise `BundleError`, or `RefusedError` where it was built without one."""
     bundle = open_bundle(folder)
+    if bundle.kind == "coupon":
+        told = Finding("DEPLOY-COUPON", "is a coupon: flat patches that are pulled open by hand", where=str(folder))
+        raise RefusedError("nothing to deploy", [told])
     if "deployed.ply" not in bundle.manifest["files"]:
         missing = Finding("DEPLOY-NONE", "was built without a prediction", where=str(folder), hint="set `response`")
         raise RefusedError("nothing to deploy", [missing])

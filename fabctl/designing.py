@@ -127,6 +127,9 @@ def inputs_for(
         return read_inputs(target, home, None, cell_mm, library)
     if is_spec and target not in TARGETS:
         raise UsageError(f"{target}: a specification says its material and cells itself; change them there")
+    if target not in TARGETS and not Path(target).exists():
+        known = ", ".join(sorted({*TARGETS, *names("specs", home)}))
+        raise UsageError(f"{target}: no such file, nor the name of a surface or a specification (known: {known})")
     source: str | MadeTarget = MadeTarget(make=target) if target in TARGETS else target
     config = SpecConfig(
         name=re.sub(r"\W", "-", Path(target).stem) or "target",

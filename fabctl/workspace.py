@@ -82,7 +82,10 @@ class Workspace:
         if "/" in name or (direct / "manifest.json").is_file():
             if not (direct / "manifest.json").is_file():
                 raise UsageError(f"{name}: no run lies there; `fabctl run list` names them")
-            return open_run(direct)
+            try:
+                return open_run(direct)
+            except RecordError as fault:
+                raise UsageError(f"{fault}; `fabctl run list` names the runs") from fault
         folders = [p for p in self.runs.iterdir() if p.is_dir()] if self.runs.is_dir() else []
         matches = [p for p in folders if p.name == name] or [
             p for p in folders if name and _begins_or_ends(p.name, name)

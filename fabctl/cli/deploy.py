@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from fabctl.cli.common import PLACE_MM, json_option, lab, progress, show
 from fabctl.cli.paths import InFolder, OutFolder
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from design.spec import Rim
     from fabctl.deploying import Laid
     from fabctl.events import Emit
+
+GIVEN = (ParameterSource.COMMANDLINE, ParameterSource.ENVIRONMENT)
 
 
 @click.command()
@@ -78,6 +81,7 @@ def command(
 
     if by_unit and parts > 1:
         raise click.UsageError("--cascade opens whole units: leave --parts out")
+    _refuse_unused(gravity, support)
     emit = progress()
     emit(Event("stage", f"reading {design}"))
     laid = read_laid(design, lab().root)
@@ -101,6 +105,17 @@ def command(
     emit(Event("stage", f"drawing {'picture and animation' if animation else 'the picture'} into {folder}"))
     _write(folder, laid, popped, settled, animation, facts)
     show(facts, as_json, _lines(facts))
+
+
+def _refuse_unused(gravity: bool, support: Rim) -> None:
+    """Raise `click.UsageError` where an option was given that another one takes all effect from."""
+    ctx = click.get_current_context()
+    given = [name for name in ("support", "friction", "level_floor") if ctx.get_parameter_source(name) in GIVEN]
+    words = [f"--{name.replace('_', '-')}" for name in given]
+    if words and not gravity:
+        raise click.UsageError(f"{', '.join(words)} says how the sheet bears its weight: give --gravity too")
+    if "friction" in given and support != "coulomb":
+        raise click.UsageError(f"--friction is that of --support coulomb, and this rim is {support}")
 
 
 def _from_hints(laid: Laid, hints: tuple[tuple[float, float, str], ...]) -> Deployed:

@@ -110,7 +110,7 @@ def cell_command(t_mm: float, theta_deg: float, material: str, output: Path | No
     from design.cells.geometry import cell_slits
     from design.cells.homogenise import Failure, solve_cell
     from design.cells.states import cell_states
-    from fabctl.errors import REFUSED
+    from fabctl.errors import DONE, REFUSED
     from fabctl.reports import cells as pictures
 
     sheet, theta = sheet_named(material), math.radians(theta_deg)
@@ -118,9 +118,8 @@ def cell_command(t_mm: float, theta_deg: float, material: str, output: Path | No
     cell = solve_cell(t_mm, theta, sheet)
     numbers = _numbers(cell, sheet)
     numbers["slits_mm"] = None if cell.verdict == "invalid" else cell_slits(t_mm, theta, sheet).tolist()
-    show(numbers, as_json, _cell_lines(numbers))
-    if cell.verdict != "bistable":
-        raise SystemExit(REFUSED)
+    why = f"the cell t = {t_mm:g} mm, θ = {theta_deg:g}° is {cell.verdict}: {cell.reason}"
+    show(numbers, as_json, _cell_lines(numbers), DONE if cell.verdict == "bistable" else REFUSED, why)
     if output is not None:
         say(f"drawing its states into {output}")
         found = cell_states(t_mm, theta, sheet)

@@ -115,3 +115,8 @@ def test_hinges_that_leave_no_slit_or_no_letter_are_refused(hinges: list[float])
     cell = select(load_library(), np.array([1.5]))
     with pytest.raises(DesignError):
         coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), hinges, Sheet(), (COLUMNS, ROWS))
+
+
+def test_a_sheet_that_there_is_not_is_told_with_those_there_are(folder: Bundle) -> None:
+    with pytest.raises(BundleError, match="there is no sheet 2; this coupon is one sheet"):
+        folder.drawing(2)
