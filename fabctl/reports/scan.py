@@ -126,7 +126,7 @@ def deviation_facts(body: dict[str, Any]) -> tuple[Fact, ...]:
         length("largest patch mean", found["max_patch_mm"], "over an even patch", "+"),
         length("largest single point", found["max_mm"], f"at ({place}) mm", "+"),
         *(
-            Fact(f"area within ± {percent(float(k), 2)}", percent(v), "of the diagonal")
+            Fact(f"area within ± {percent(float(k), 2)} of the diagonal", percent(v))
             for k, v in found["within_frac"].items()
         ),
         Fact("target seen", percent(found["coverage_frac"]), "of its area"),

@@ -21,6 +21,8 @@ from fabctl.reports.scan import TITLE, scan_step
 from fabctl.reports.view3d import script
 from fabctl.workspace import Specimen, Workspace
 
+WITHIN = "area within ± 1.00 % of the diagonal"
+
 
 def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
     """Return the page about `specimen` from its records; what was not done is named as missing."""
@@ -104,7 +106,7 @@ def _keys(steps: Sequence[Step], latest: dict[str, RunFolder]) -> Iterator[Fact]
     facts = {(step.title, fact.label): fact for step in steps for fact in step.facts}
     wanted = (
         (TITLE, "RMS", "RMS deviation"),
-        (TITLE, "area within ± 1.00 %", "area within ± 1.00 % of the diagonal"),
+        (TITLE, WITHIN, WITHIN),
         ("Indentation", "secant stiffness", "secant stiffness"),
         ("Indentation", "largest force", "largest force"),
         ("Design", "cells", "cells"),
