@@ -169,8 +169,8 @@ def _screen(plan: IndentPlan, bench: str) -> Iterator[str]:
     yield f"  predicted peak {peak:.2f} N" if peak is not None else "  no predicted response"
     count = len({(a.point, a.curve) for a in plan.actions if a.curve})
     yield f"  {count} curves, about {plan.time_s:.0f} s, {plan.sample_hz:g} samples a second"
-    if plan.resumes:
-        yield f"  goes on with {plan.resumes}"
+    if plan.resumed is not None:
+        yield f"  goes on with {plan.resumed.run_id}"
     for finding in plan.findings:
         yield f"  {finding}"
 

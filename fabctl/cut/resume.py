@@ -14,7 +14,7 @@ from typing import Any
 from design.findings import Finding, errors
 from drivers.grbl.laser import Laser
 from drivers.grbl.messages import Vector
-from fabctl.bench import Bench
+from fabctl.bench import Bench, begun_elsewhere
 from fabctl.cut.execute import minutes
 from fabctl.cut.job import (
     CutDone,
@@ -118,10 +118,8 @@ def _plan_rest(laser: Laser, bench: Bench, order: CutOrder, before: RunFolder) -
         raise _refused(
             "RESUME-OFFSET", f"the work offset is {identity.work_offset_mm()}, it was {offset}", "set it back"
         )
-    there = recorded_config["bench"]["name"]
-    if there != bench.config.name:
-        text = f"{before.run_id} was cut on bench {there}, this is {bench.config.name}"
-        raise _refused("RESUME-BENCH", text, "resume where the sheet lies")
+    if elsewhere := begun_elsewhere(before, bench.config):
+        raise RefusedError("the cut cannot be resumed", elsewhere)
     if sha256(before.artefact("job.nc")) != recorded_config["plan"]["job_sha256"]:
         raise _refused("RESUME-PROGRAM", f"the program of {before.run_id} is not the one sent", "cut the design anew")
     program = read_program(before.artefact("job.nc").read_text(encoding="ascii").splitlines())

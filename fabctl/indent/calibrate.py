@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -11,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from drivers.clock import Clock, WallClock
-from drivers.errors import DeviceError
 from drivers.rig.indenter import Indenter
 from fabctl.config.bench import RigConfig
 from fabctl.config.method import Approach, Cycles, LimitsConfig, MethodConfig, Tare
@@ -29,6 +29,7 @@ from fabctl.indent.calibration import (
 from fabctl.indent.method import actions
 from fabctl.indent.recorder import Recorder
 from fabctl.indent.run import Runner
+from fabctl.records.ending import outcome_kept
 from fabctl.records.folder import RunFolder, start_run
 
 MASS_TOLERANCE_RATIO = 5e-5  # OIML class M1 from 100 g on, as a standard uncertainty
@@ -126,11 +127,8 @@ def calibrate_force(
 ) -> tuple[RunFolder, dict[str, Any]]:
     """Calibrate the load cell, keep the record, and make it the bench's current one."""
     run = start_run(lab / "runs", "calibrate", config={"what": "force", "bench": bench, "masses_kg": list(masses_kg)})
-    try:
+    with outcome_kept(run):
         body = force_result(read_masses(rig, masses_kg, put_on, clock or WallClock(), emit))
-    except (DeviceError, FabctlError) as fault:
-        run.finish("failed", str(fault))
-        raise
     before = load_calibration(lab, bench) or Calibration()
     save_calibration(
         lab,
@@ -164,17 +162,10 @@ def calibrate_frame(
     method = frame_method(config, force_N)
     run = start_run(lab / "runs", "calibrate", config={"what": "frame", "bench": bench, "method": method.model_dump()})
     before = load_calibration(lab, bench) or Calibration()
-    recorder = Recorder(run.path / "samples.csv")
-    try:
-        runner = Runner(rig, method, actions(method), recorder, clock or WallClock(), config.sample_hz, emit)
-        try:
-            runner.execute()
-        finally:
-            recorder.close()
+    with outcome_kept(run):
+        with contextlib.closing(Recorder(run.path / "samples.csv")) as recorder:
+            Runner(rig, method, actions(method), recorder, clock or WallClock(), config.sample_hz, emit).execute()
         body = frame_result(run.path / "samples.csv", before.gain_ratio or 1.0, block_mm_N)
-    except (DeviceError, FabctlError) as fault:
-        run.finish("failed", str(fault))
-        raise
     save_calibration(
         lab,
         bench,
