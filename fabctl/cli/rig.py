@@ -28,9 +28,12 @@ def command() -> None:
 @bench_option
 @json_option
 def info(bench_name: str, as_json: bool) -> None:
-    """Say who answers and how it stands; nothing moves."""
+    """Say who answers and how it stands, and where its map contradicts itself; nothing moves."""
+    from drivers.rig.plausible import contradictions
+
     with _rig(bench_name, "asking the rig") as (rig, _):
         identity, air, now = rig.identify(), rig.environment(), rig.fresh_sample()
+        doubts = list(contradictions(rig.registers))
     body = {
         "model": identity.model,
         "serial": identity.serial,
@@ -40,7 +43,8 @@ def info(bench_name: str, as_json: bool) -> None:
         **air,
         **_state(now),
     }
-    show(body, as_json, [f"{name:18} {value}" for name, value in body.items()])
+    lines = [f"{name:18} {_spoken(value)}" for name, value in body.items()]
+    show({**body, "doubts": doubts}, as_json, [*lines, *(f"doubt: {each}; is that so?" for each in doubts)])
 
 
 @command.command()
@@ -279,6 +283,12 @@ def _sampled(rig: Indenter, time_s: float) -> list[Sample]:
         found.append(rig.fresh_sample())
         clock.sleep(0.01)
     return found
+
+
+def _spoken(value: object) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _state(sample: Sample) -> dict[str, Any]:

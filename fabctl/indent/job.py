@@ -12,6 +12,7 @@ from typing import Any
 from design.findings import Finding, errors
 from drivers.clock import Clock, WallClock
 from drivers.rig.indenter import Identity, Indenter, open_indenter
+from drivers.rig.plausible import contradictions
 from drivers.rig.registers import RegisterMap
 from fabctl.bench import Bench, refuse_without
 from fabctl.config.bench import BenchConfig, RigConfig, find
@@ -96,6 +97,7 @@ def plan_test(
     predicted = read_predicted(response) if response.is_file() else None
     calibration = load_calibration(lab.root, bench.name)
     findings += check(steps, read, bench.rig, predicted, "move_stage" in registers.commands)
+    findings += [Finding("RIG-MAP", f"map {registers.name}: {each}", "warning") for each in contradictions(registers)]
     found = conditions(specimen.record(), facts or {})
     findings += unrecorded(found)
     findings += calibration.findings() if calibration is not None else _uncalibrated(bench.name)

@@ -15,7 +15,7 @@ import numpy as np
 from design.findings import Finding
 from drivers.clock import Clock
 from drivers.errors import DeviceError
-from drivers.rig.indenter import Indenter, Limits, ended
+from drivers.rig.indenter import Indenter, Limits
 from drivers.rig.samples import Sample
 from fabctl.config.method import MethodConfig
 from fabctl.errors import FabctlError, RefusedError
@@ -327,7 +327,7 @@ class Runner:
         """Sample until a command is over and the stage stands; None where the operator paused it."""
         while True:
             found = self.sampler.fresh()
-            if ended(found, number) and found.state != "moving":
+            if self.rig.ended(found, number) and found.state != "moving":
                 return found
             if self.wish() == "pause":
                 self._pause()

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import DeviceRefused
-from drivers.rig.indenter import Indenter, Limits, RigFaulted
+from drivers.rig.indenter import Indenter, Limits
+from drivers.rig.refusals import RigFaulted
 from drivers.rig.registers import BadReply, RegisterMap, Table
 from drivers.rig.samples import Sample
 from fabctl.config.loader import parse

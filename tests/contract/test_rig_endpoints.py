@@ -15,7 +15,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from drivers.errors import DeviceRefused, DeviceTimeout, ProtocolError, TransportError
-from drivers.rig.indenter import Indenter, Limits, RigFaulted, open_indenter
+from drivers.rig.indenter import Indenter, Limits, open_indenter
+from drivers.rig.refusals import RigFaulted
 from drivers.rig.samples import Sample
 from tests.rig_endpoints import ENDPOINTS, PATIENT, endpoint, free_port, simulated_rig
 
