@@ -116,7 +116,7 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
     named = parse_groups(lab(), runs, groups)
     if not named:
         raise UsageError("name at least one run, specimen or --group")
-    body = analyse_groups(named, output)
+    body = analyse_groups(named, output, progress())
     lines = []
     for name, found in body["groups"].items():
         lines.append(f"{name}: {len(found['runs'])} runs")

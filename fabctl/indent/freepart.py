@@ -28,9 +28,10 @@ DRIFT_MAX_FRAC = 0.3  # a free part that climbs by more than this share of the l
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """The free part of a curve. `start` is the index of the first sure rise.
+    """The free part of a curve. `start` is the index of the first sure rise, `rise_mm` its position.
 
-    `slope_N_mm` is the drift where it is evident, else 0; `drift_N_mm` is what the free part may be expected to slope.
+    `slope_N_mm` is the drift where it is evident, else 0; `drift_N_mm` is what the free part may be expected to slope;
+    where it `bends` nothing is expected.
     """
 
     start: int
@@ -38,6 +39,8 @@ class Free:
     noise_N: float
     slope_N_mm: float = 0.0
     drift_N_mm: float = DRIFT_N_MM
+    rise_mm: float = -np.inf
+    bends: bool = False
 
 
 def find_free(u: Reals, f: Reals) -> Free | str:
@@ -63,7 +66,7 @@ def find_free(u: Reals, f: Reals) -> Free | str:
             f"before the rise the force already climbs by {1000 * slope_N_mm:.1f} mN/mm, after it by "
             f"{1000 * steepest_N_mm:.1f}: the curve begins in contact, or the load cell drifts too much"
         )
-    return Free(start, level_N, settled_N, slope_N_mm, drift_N_mm)
+    return Free(start, level_N, settled_N, slope_N_mm, drift_N_mm, float(u[start]))
 
 
 def _followed(f: Reals, noise_N: float, slow_ratio: float) -> tuple[int, float, float] | str:

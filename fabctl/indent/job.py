@@ -155,6 +155,7 @@ def run_test(
             ending = _record(run, plan, rig, emit, steering or Steering(), clock or WallClock())
             run.write_result(_sampled(plan, ending))
             run.finish("done")  # the samples are whole: what breaks off the figures takes nothing from them
+    emit(Event("stage", "recorded; computing the figures"))
     try:
         _add_figures(run, plan, ending)
     except KeyboardInterrupt:
@@ -228,10 +229,11 @@ def _drifting(curves: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
     drift_N_mm = (worst or {}).get("drift_N_mm") or 0.0
     if worst is not None and abs(drift_N_mm) > DRIFT_TOLD_FRAC * abs(worst.get("stiffness_secant_N_mm") or 0.0):
         count = sum(bool(curve.get("drift_N_mm")) for curve in curves)
+        bent = " (it bends; what that leaves open of the contact is in its error)" if worst.get("drift_N_mm2") else ""
         yield Finding(
             "INDENT-DRIFT",
             f"in {count} of {len(curves)} curves the force drifts before contact, by up to {1000 * drift_N_mm:.2g} "
-            "mN/mm; the contact is found beside it, forces under load may hold it",
+            f"mN/mm{bent}; the contact is found beside it, forces under load may hold it",
             "warning",
             hint="let the load cell warm up, look for a cable that is dragged along, go faster",
         )

@@ -27,17 +27,12 @@ from fabctl.workspace import Specimen, Workspace
 from simulators.rig.controller import Controller, Machine
 from simulators.specimens import curve
 from simulators.specimens.analytic import linear
+from tests.rig_endpoints import short_method
 
-METHOD = """name: short
-safe_height_mm: 0.2
-travel_speed_mm_s: 20
-acceleration_mm_s2: 200
-limits: {force_N: 4, tension_N: 1, travel_mm: 40}
-steps:
-  - {step: tare, time_s: 0.3}
-  - {step: approach, speed_mm_s: 4, trigger_N: 0.02, clearance_mm: 0.8}
-  - {step: cycles, cycles_count: 2, depth_mm: 2.6, speed_mm_s: 3, unload_speed_mm_s: 6}
-"""
+METHOD = short_method(
+    "step: approach, speed_mm_s: 4, trigger_N: 0.02, clearance_mm: 0.8",
+    "step: cycles, cycles_count: 2, depth_mm: 2.6, speed_mm_s: 3, unload_speed_mm_s: 6",
+)
 RIG = RigConfig(url="memory:", map="reference", travel_mm=60, force_limit_N=20, indenter_radius_mm=8)
 BENCH = BenchConfig(name="here", rig=RIG)
 MACHINE = Machine(noise_N=0.001, contact_mm=2.0, parked_mm=0.2, backlash_mm=0.0)
