@@ -25,6 +25,7 @@ from design.cells.homogenise import Failure
 from design.cells.library import load_library
 from design.cells.mesh import REFERENCE, Density, topology
 from design.cells.periodic import periodic_cell, positions, smallest_eigenvalues
+from design.cells.select import select
 from design.cells.sheet import Sheet
 from design.cells.stability import out_of_plane_eigenvalues
 from design.cells.sweep import column_t_mm, plan_of, thetas_rad
@@ -43,6 +44,7 @@ STATES = (
     (2.84, -18.57),
     (0.65, 21.43),
 )  # t in mm, θ in degrees
+CURVE_RATIOS = np.array([1.16, 1.18, 1.2, 1.23, 1.26, 1.29, 1.35, 1.45, 1.55, 1.65, 1.75])
 
 
 def measure(words: list[str]) -> list[Figure]:
@@ -151,20 +153,33 @@ def _growth() -> Iterator[Figure]:
 
 
 def _stability() -> Iterator[Figure]:
-    plane, out = [], []
     for t_mm, theta_deg in STATES:
-        found = homogenise.solve_pair(t_mm, np.radians(theta_deg), SHEET, REFERENCE)
-        if isinstance(found, Failure):
+        found = _eigenvalues(t_mm, np.radians(theta_deg))
+        if found is None:
             continue
-        m, pair = found
-        s = pair.stable.s_ratio
-        cell = periodic_cell(m, 8)
-        at = positions(cell, m, m.nodes(pair.stable.y, s), s)
-        plane.append(float(smallest_eigenvalues(cell, at, s * np.eye(2), 2)[0]))
-        out.append(float(out_of_plane_eigenvalues(cell, at, s * np.eye(2), SHEET.thickness_mm, 2)[1]))
         where = f"t {t_mm:g} mm, θ {theta_deg:g}°, 2 × 2 cell"
-        yield Figure(f"smallest eigenvalue in the plane, {where}", plane[-1], "", "> 0", plane[-1] > 0, 1)
-        yield Figure(f"smallest eigenvalue out of the plane, {where}", out[-1], "1/mm²", "> 0", out[-1] > 0, 1)
+        yield Figure(f"smallest eigenvalue in the plane, {where}", found[0], "", "> 0", found[0] > 0, 1)
+        yield Figure(f"smallest eigenvalue out of the plane, {where}", found[1], "1/mm²", "> 0", found[1] > 0, 1)
+    chosen = select(load_library(), CURVE_RATIOS)
+    pairs = zip(chosen.t_mm, chosen.theta_rad, strict=True)
+    values = [found for t_mm, theta in pairs if (found := _eigenvalues(float(t_mm), float(theta))) is not None]
+    where = f"cells that designs choose, {CURVE_RATIOS[0]:g} to {CURVE_RATIOS[-1]:g}"
+    for k, (name, unit) in enumerate((("in the plane", ""), ("out of the plane", "1/mm²"))):
+        least = min(value[k] for value in values)
+        yield Figure(f"smallest eigenvalue {name}, {where}", least, unit, "> 0", least > 0, len(values))
+
+
+def _eigenvalues(t_mm: float, theta_rad: float) -> tuple[float, float] | None:
+    """Return the second state's smallest eigenvalue in the plane and out of it, on a 2 × 2 cell."""
+    found = homogenise.solve_pair(t_mm, theta_rad, SHEET, REFERENCE)
+    if isinstance(found, Failure):
+        return None
+    m, pair = found
+    s = pair.stable.s_ratio
+    cell = periodic_cell(m, 8)
+    at = positions(cell, m, m.nodes(pair.stable.y, s), s)
+    plane = smallest_eigenvalues(cell, at, s * np.eye(2), 2)[0]
+    return float(plane), float(out_of_plane_eigenvalues(cell, at, s * np.eye(2), SHEET.thickness_mm, 2)[1])
 
 
 def _rubber() -> Iterator[Figure]:

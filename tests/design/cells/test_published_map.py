@@ -20,8 +20,8 @@ HEAD = "t_over_l0,theta_rad,expansion_ratio,energy_barrier,stiffness\n"
 
 
 def map_text(t_step: float = 0.004, theta_step: float = 0.02) -> str:
-    """Return a map of the shipped library on another grid, energies in the published unit."""
-    library, sheet = load_library(), Sheet()
+    """Return a map of the shipped library on another grid, of one mesh as a published one is, in its unit of energy."""
+    library, sheet = load_library().firm(), Sheet()
     t, theta = np.meshgrid(np.arange(0.05, 0.29, t_step), np.arange(-0.3, 0.5, theta_step), indexing="ij")
     cells = library.at(10 * t, theta)
     per_mJ = 800 / (sheet.E_MPa * sheet.thickness_mm * sheet.edge_mm**2)
