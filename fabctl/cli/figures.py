@@ -22,8 +22,6 @@ UNITS = {
     "h": "h",
     "kg": "kg",
     "g": "g",
-    "ratio": "",
-    "frac": "",
     "count": "",
 }
 UNIT = re.compile(rf"_({'|'.join(UNITS)})$")

@@ -89,7 +89,7 @@ def home(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
     _moved(bench_name, way, yes, as_json)
 
 
-@command.command()
+@command.command(context_settings={"ignore_unknown_options": True})  # -5 is a place, no option
 @click.argument("by_mm", type=PLACE_MM)
 @bench_option
 @click.option("--speed-mm-s", type=SPEED_MM_S, default=1.0, show_default=True, help="How fast the stage moves.")

@@ -51,6 +51,7 @@ def test_by_hand_the_stage_is_homed_jogged_to_the_first_touch_and_drawn_back(ben
     bench.fabctl("rig", "jog", "3", *ON, expect=5)  # nobody said yes
     assert bench.fabctl("rig", "info", *ON)["position_mm"] == pytest.approx(0.0, abs=0.01)
     assert bench.fabctl("rig", "jog", "3", *ON, "--yes")["position_mm"] == pytest.approx(3.0, abs=0.01)
+    assert bench.fabctl("rig", "jog", "-1", *ON, "--yes")["position_mm"] == pytest.approx(2.0, abs=0.01)
     touched = bench.fabctl("rig", "jog", "20", *ON, "--yes", "--speed-mm-s", "4")
     assert touched["force_gross_N"] == pytest.approx(1.05, abs=0.08)  # it brakes
     assert touched["position_mm"] == pytest.approx(8.1, abs=0.2)

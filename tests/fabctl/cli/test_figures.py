@@ -21,7 +21,7 @@ def test_figures_have_their_unit_four_digits_and_the_reason_where_they_are_missi
         "stiffness secant: 0.4998 N/mm",
         "peak depth: not found: the force rises to the end of the loading",
         "predicted secant: none",
-        "hysteresis: 0.1",
+        "hysteresis ratio: 0.1",
         "curves: 2",
     ]
 
