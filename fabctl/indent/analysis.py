@@ -170,6 +170,7 @@ def _one(numbered: Numbered) -> dict[str, Any]:
         "noise_N": contact.noise_N,
         "drift_N_mm": contact.drift_N_mm,
         "drift_N_mm2": contact.drift_N_mm2,
+        "spikes_count": result.spikes_count,
         "depth_max_mm": result.depth_max_mm,
         "not_found": dict(result.reasons),
     }

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fabctl.indent.freepart import FREE_MIN, WIDTH, Free, find_free
+from fabctl.indent.freepart import FREE_MIN, WIDTH, Free, find_free, noise_of_N, without_spikes
 
 Reals = NDArray[np.float64]
 
@@ -127,6 +127,8 @@ def first_touch(position_mm: Reals, force_N: Reals) -> float | None:
 
     Quick, some milliseconds: it is asked between two samples, while a watchdog waits for the next.
     """
+    if len(force_N) > 3 * FREE_MIN:
+        force_N, _ = without_spikes(force_N, noise_of_N(position_mm, force_N)[0])
     u, f = _thinned(position_mm, force_N, TOUCH_COUNT, TOUCH_MM)
     free = find_free(u, f)
     if isinstance(free, str):

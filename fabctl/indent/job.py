@@ -193,7 +193,7 @@ def _sampled(plan: IndentPlan, ending: Ending) -> dict[str, Any]:
 def _add_figures(run: RunFolder, plan: IndentPlan, ending: Ending) -> None:
     """Compute the run's figures and write them beside what is known; a run without any contact has failed."""
     body = {**_sampled(plan, ending), **summarise_run(run)}
-    body["findings"] += [f.as_dict() for f in _drifting(body["curves"])]
+    body["findings"] += [f.as_dict() for f in (*_drifting(body["curves"]), *_disturbed(body["curves"]))]
     run.write_result(body)
     if (body["curves"] or ending.no_contact) and all(curve["contact_mm"] is None for curve in body["curves"]):
         reason = "no curve has a contact: was a specimen in place, and the indenter free when it was tared?"
@@ -237,6 +237,14 @@ def _drifting(curves: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
             "warning",
             hint="let the load cell warm up, look for a cable that is dragged along, go faster",
         )
+
+
+def _disturbed(curves: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
+    """Say how many single samples stood out and were left out of the figures."""
+    count = sum(curve.get("spikes_count") or 0 for curve in curves)
+    if count:
+        text = f"{count} single samples of the force stand out far on both sides and are left out of the figures"
+        yield Finding("INDENT-SPIKES", text, "warning", hint="earth the shield, keep the cell's cable from the motor's")
 
 
 def _untouched(without: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:

@@ -175,3 +175,14 @@ def test_a_load_cell_behind_a_filter_errs_slowly_and_is_believed_less(name: str)
     off_mm = [abs((one.position_mm or 0.0) - 7.3) for one in found]
     assert max(off_mm) < 0.05
     assert min(one.se_mm or 0.0 for one in found) > 0.006
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 4])
+def test_a_slow_wave_before_contact_is_noise_and_no_contact(seed: int) -> None:
+    """Draughts sway a soft cell: taken for a start, they put the contact a millimetre early."""
+    rng = np.random.default_rng(seed)
+    u = np.arange(0, 5.0, 0.01)
+    loaded = np.maximum(u - 1.5, 0.0)
+    quiet = 0.6 * loaded - 0.09 * loaded**2 + 0.006 * loaded**3 + rng.normal(0, 0.002, len(u))
+    found = find_contact(u, quiet + 0.01 * np.sin(0.018 * np.pi * np.arange(len(u)) + rng.uniform(0, 6)))
+    assert found.position_mm == pytest.approx(1.5, abs=0.06)
