@@ -81,6 +81,11 @@ class Fit:
     count: int
 
     @property
+    def bend_N_mm2(self) -> float:
+        """Return the drift's parabola, 0 where none was fitted."""
+        return float(self.coefficients[-1]) if len(self.coefficients) > RISE + len(self.powers) else 0.0
+
+    @property
     def misfit(self) -> float:
         """Return by how many of its standard deviations chi² exceeds its mean."""
         return (self.chi2 - self.count) / float(np.sqrt(2 * self.count))
@@ -98,8 +103,7 @@ def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
     if straight is None:
         reason = "no window after the rise is long enough to fit"
         return Contact(None, reason, noise_N=noise_N, baseline_N=level_N, others_mm=others)
-    bent = _bent_fit(u, f, free, straight)
-    best = bent or straight
+    best = _with_bend(u, f, free, straight)
     # Between two samples nothing is known of how the contact begins.
     se_mm = float(np.hypot(best.se_mm, np.median(np.diff(u)) / np.sqrt(12)))
     sloped = best.powers == SLOPED
@@ -112,8 +116,8 @@ def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
         noise_N=noise_N,
         baseline_N=float(best.coefficients[0]),
         baseline_N_mm=float(best.coefficients[1]),
-        drift_N_mm=free.slope_N_mm if bent is None else float(bent.coefficients[1]),
-        drift_N_mm2=0.0 if bent is None else float(bent.coefficients[-1]),
+        drift_N_mm=float(best.coefficients[1]) if best.bend_N_mm2 else free.slope_N_mm,
+        drift_N_mm2=best.bend_N_mm2,
         others_mm=others,
     )
     if se_mm > SE_MAX_MM:
@@ -174,12 +178,13 @@ def _best_fit(u: Reals, f: Reals, free: Free) -> Fit | None:
     return taken[-1] if taken else None
 
 
-def _bent_fit(u: Reals, f: Reals, free: Free, straight: Fit) -> Fit | None:
-    """Return the fit whose free part is a parabola, where that part is curved and this explains it clearly better.
+def _with_bend(u: Reals, f: Reals, free: Free, straight: Fit) -> Fit:
+    """Return the fit with a parabola for the free part where that explains all clearly better, else `straight`.
 
-    A drift that bends is else taken for the specimen. Better it must be than a straight free part with one power more
-    under load. How far the contact hangs on the drift being a parabola is seen by leaving the first half of the free
-    part out; it is held in the error.
+    A drift that bends is else taken for the specimen. The part must be curved, and the parabola better than a straight
+    line with one power more under load, and than a corner, which is where a specimen is met that stiffens later. The
+    error holds how far the contact lies off without the first half of the free part, and the other view as far as it
+    is likely.
     """
     bends = replace(free, bends=True)
     top_mm = float(u[int(np.argmax(f[free.start :])) + free.start])
@@ -188,14 +193,20 @@ def _bent_fit(u: Reals, f: Reals, free: Free, straight: Fit) -> Fit | None:
         end = int(np.searchsorted(u, contact_mm + max(NEAR_FRAC * (top_mm - contact_mm), NEAR_MM)))
         found = _wherever(u[:end], f[:end], (SLOPED, HERTZIAN), bends)
         contact_mm = found.contact_mm
-    if found.misfit > MISFIT_SIGMA or not _is_bent(u, f, contact_mm, free):
-        return None
+    worse = _worse_than_a_corner(u, f, contact_mm, free)
+    if found.misfit > MISFIT_SIGMA or worse is None:
+        return straight
     plain = _wherever(u[:end], f[:end], ((*SLOPED, 4.0), (*HERTZIAN, 4.5)), free)
     if plain.chi2 - found.chi2 < CLEARLY:
-        return None
+        return straight
+    likely = 1 / (1 + float(np.exp(np.clip(worse / 2, -50, 50))))
+    apart_mm = contact_mm - straight.contact_mm
+    if worse > 0:
+        return replace(straight, se_mm=float(np.hypot(straight.se_mm, likely * apart_mm)))
     later = int(np.searchsorted(u, (float(u[0]) + contact_mm) / 2))
     half = _wherever(u[later:end], f[later:end], (SLOPED, HERTZIAN), bends)
-    return replace(found, se_mm=float(np.hypot(found.se_mm, half.contact_mm - contact_mm)))
+    doubts = (found.se_mm, half.contact_mm - contact_mm, (1 - likely) * apart_mm)
+    return replace(found, se_mm=float(np.linalg.norm(doubts)))
 
 
 def _wherever(u: Reals, f: Reals, kinds: tuple[tuple[float, ...], tuple[float, ...]], free: Free) -> Fit:
@@ -204,21 +215,18 @@ def _wherever(u: Reals, f: Reals, kinds: tuple[tuple[float, ...], tuple[float, .
     return _chosen(_scan(u, f, *around, kinds[0], free), _scan(u, f, *around, kinds[1], free))
 
 
-def _is_bent(u: Reals, f: Reals, until_mm: float, free: Free) -> bool:
-    """Tell whether the force before `until_mm` is curved beyond its noise, and rather so than it has a corner.
-
-    A corner is where a specimen is met that stiffens later.
-    """
+def _worse_than_a_corner(u: Reals, f: Reals, until_mm: float, free: Free) -> float | None:
+    """Return by how much chi² a parabola is worse than a corner before `until_mm`; None where nothing is curved."""
     x, part = u[u < until_mm], f[u < until_mm]
     if len(x) < 2 * FREE_MIN:
-        return False
+        return None
     design = np.vander((x - x.mean()) / float(np.ptp(x)), 3)
     weights = np.linalg.lstsq(design, part, rcond=None)[0]
     off = part - design @ weights
     if abs(weights[0]) < BENT_SIGMA * free.noise_N * np.sqrt(np.linalg.inv(design.T @ design)[0, 0]):
-        return False
+        return None
     corner = _scan(x, part, float(x[0]), 0.0, float(np.ptp(x)), (1.0,), replace(free, drift_N_mm=STEEP_N_MM))
-    return bool(off @ off < corner.chi2 * free.noise_N**2)
+    return float(off @ off) / free.noise_N**2 - corner.chi2
 
 
 def _chosen(sloped: Fit, hertzian: Fit) -> Fit:
