@@ -23,6 +23,7 @@ from fabctl.indent.job import IndentPlan, Steering, plan_test, refuse, run_test
 from fabctl.indent.sampling import Wish
 from fabctl.records.ending import undisturbed
 from fabctl.records.folder import RunFolder, status_of
+from fabctl.reports.indent_step import indent_step
 from fabctl.workspace import Specimen, Workspace
 from simulators.rig.controller import Controller, Machine
 from simulators.specimens import curve
@@ -88,9 +89,11 @@ def test_an_interrupt_while_figures_are_computed_takes_nothing_from_the_recordin
     assert status_of(run) == "done"
     before = run.result() or {}
     assert before["rows_count"] > 100
+    assert "its figures are not computed" in indent_step(run, lab.specimen.design).notes[0]
     found = analyse_groups({"S": [run]})["groups"]["S"]["runs"][0]["result"]
     assert found["stiffness_secant_N_mm"] == pytest.approx(0.5, rel=0.02)
     assert (run.result() or {})["rows_count"] == before["rows_count"]
+    assert not any("not computed" in note for note in indent_step(run, lab.specimen.design).notes)
     with pytest.raises(RefusedError, match="came to its end"):
         refuse(lab.plan(resume=run))
 
