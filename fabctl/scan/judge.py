@@ -16,6 +16,7 @@ from fabctl.scan.target import Target
 Floats = NDArray[np.float64]
 
 KEEP_CLOUD_FRAC, KEEP_TARGET_FRAC = 0.92, 0.7  # the rest is held at its edge: outliers, and what was not seen
+STRAY_RATIO = 0.12  # of the points in the cube about a usual point; a cube with fewer holds stray points
 EXPLAINED_FRAC = 0.025  # of the diagonal; a point nearer to the target than this is explained by the pose
 WORST_RMS_FRAC = 0.02
 LEAST_COVERAGE_FRAC, LEAST_EXPLAINED_FRAC = 0.45, 0.75
@@ -61,7 +62,11 @@ class Judged:
 
 
 def thin(points: Floats, count: int, seed: int) -> Floats:
-    """Return about `count` points spread evenly over the cloud's surface, in random order."""
+    """Return about `count` points spread evenly over the cloud's surface, in random order.
+
+    Where there are enough points to tell, cubes that hold much fewer than usual are left out: spread over a volume,
+    stray points would fill as many cubes as the surface.
+    """
     if len(points) <= count:
         return points[np.random.default_rng(seed).permutation(len(points))]
     low = points.min(axis=0)
@@ -69,7 +74,9 @@ def thin(points: Floats, count: int, seed: int) -> Floats:
     for _ in range(12):
         index = ((points - low) / size).astype(np.int64)
         side = index.max() + 2
-        _, first = np.unique((index[:, 0] * side + index[:, 1]) * side + index[:, 2], return_index=True)
+        keys = (index[:, 0] * side + index[:, 1]) * side + index[:, 2]
+        _, first, held = np.unique(keys, return_index=True, return_counts=True)
+        first = first[held >= STRAY_RATIO * np.average(held, weights=held)]
         if 0.8 * count <= len(first) <= 1.5 * count:
             break
         size *= float(np.clip(np.sqrt(len(first) / (1.1 * count)), 0.3, 3.0))

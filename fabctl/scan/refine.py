@@ -33,6 +33,7 @@ FLOOR_FRAC = 2e-5  # of the diagonal; below it a patch's residual is rounding, n
 SLID_FRAC = 1e-3  # of the diagonal; a step this small ends the sliding
 SLIDING_SIGMA_FRAC = 2e-3  # while sliding, patches hold no tighter than this and the rim pulls with its median
 GROW_LIMIT_RATIO = 0.05
+UNDONE_RATIO = 0.2  # a step that undoes the one before it up to this part ends the work
 
 Weighting = Literal["robust", "least-squares"]
 
@@ -72,6 +73,7 @@ class Options:
     weighting: Weighting = "robust"
     use_patches: bool = True
     use_rim: bool = True
+    slides: bool = True  # False: the start is a refined pose, its rim is where it should be
     steps_count: int = 25
     still_frac: float = 1e-5  # of the diagonal; a smaller step ends the work
     band_frac: float = 0.05  # of the diagonal; farther points are not compared at first
@@ -82,9 +84,9 @@ class Options:
 
 def refine(points: Floats, start: Similarity, target: Target, options: Options = Options()) -> Fit:
     """Return the fit of the cloud's `points` (n, 3), as read, from the pose `start`, which must be near."""
-    pose, band, reach = start, options.band_frac, REACH_FIRST_FRAC
+    pose, band, reach = start, options.band_frac, REACH_FIRST_FRAC if options.slides else REACH_FRAC
     patch_tree = _patch_tree(target)
-    moved = np.inf
+    moved, before = np.inf, np.zeros(7)
     steps_count = 0
     while steps_count < options.steps_count:
         steps_count += 1
@@ -97,12 +99,18 @@ def refine(points: Floats, start: Similarity, target: Target, options: Options =
         band = max(0.6 * band, 0.02, 12 * sigma)
         if sliding and (moved < SLID_FRAC or steps_count >= options.steps_count // 2):
             reach = REACH_FRAC
-        elif moved < options.still_frac:
+        elif moved < options.still_frac or _undone(x, before):
             break
+        before = x
     rows = patch_rows(points, pose, target, patch_tree, band) if options.use_patches else _no_rows()
     rim = rim_rows(points, pose, target, REACH_FRAC, options.rest) if options.use_rim else None
     _, weight, rim_weight, sigma = solve(rows, rim, options, sliding=False)
     return Fit(pose, rows, rim, weight, rim_weight, sigma, steps_count, moved)
+
+
+def _undone(x: Floats, before: Floats) -> bool:
+    """Return whether the step undoes the one before it: two sets of pairs take turns, and will for ever."""
+    return bool(np.linalg.norm(x + before) < UNDONE_RATIO * np.linalg.norm(x))
 
 
 def moved_by(pose: Similarity, x: Floats, target: Target) -> Similarity:

@@ -38,7 +38,7 @@ Mask = NDArray[np.bool_]
 RIVAL_RATIO = 1.10  # poses that fit within this of the best are listed, and must be explained
 SEARCH_POINTS = 4000
 FIT_POINTS = 8_000  # for judging poses; the chosen one is refined with FINAL_POINTS
-FINAL_POINTS = 150_000
+ROUGH_POINTS, FINAL_POINTS = 20_000, 150_000  # the statistics of the points show in the scale
 DENSE_POINTS = 60_000
 JUDGE_POINTS = 4000
 CANDIDATES = 6
@@ -46,7 +46,7 @@ LEAST_MEMBERS = 200
 MIRROR_BETTER_RATIO = 0.7
 MIRROR_DOUBT_FRAC = 0.005
 SAME_POSE_FRAC, NEAR_POSE_FRAC = 0.004, 0.06
-FINAL_ROUNDS, SETTLED_FRAC = 3, 1e-4  # of the diagonal
+FINAL_ROUNDS, SETTLED_FRAC = 2, 1e-4  # of the diagonal
 PUSHES_FRAC = (-0.04, -0.015, 0.015, 0.04)
 
 NO_SYMMETRIES = Symmetries((), None, None)
@@ -314,14 +314,15 @@ def _finished(
     body: Body,
     decided_by: str = "geometry",
 ) -> Registration:
-    specimen = specimen_points(task, body.part, best.pose)
+    specimen, options = specimen_points(task, body.part, best.pose), task.options
     if status in ("aligned", "symmetric") and specimen.sum() > 500:
-        for _ in range(FINAL_ROUNDS):  # which points are the specimen hangs a little on the pose
+        for most in (ROUGH_POINTS, *(FINAL_POINTS,) * FINAL_ROUNDS):  # which points count hangs a little on the pose
             chosen, before = task.points[specimen], best.pose
-            final = refine(chosen[:: max(1, len(chosen) // FINAL_POINTS)], before, task.target, task.options)
-            best = replace(best, fit=final)
+            final = refine(chosen[:: max(1, len(chosen) // most)], before, task.target, options)
+            best, options = replace(best, fit=final), replace(options, slides=False)
             specimen = specimen_points(task, body.part, best.pose)
-            if NO_SYMMETRIES.apart_frac(before, best.pose, task.target) < SETTLED_FRAC:
+            settled = NO_SYMMETRIES.apart_frac(before, best.pose, task.target) < SETTLED_FRAC
+            if settled and most == FINAL_POINTS:
                 break
     findings = tuple(findings_of(status, best, alternatives, body.part, task.cleaned, task.symmetries, task.target))
     return Registration(status, best, alternatives, body.part, specimen, task.symmetries, findings, decided_by)
