@@ -253,8 +253,8 @@ class Way:
     word: str
     question: str
     speed_mm_s: float
-    goal_mm: Callable[[Sample], float]
-    begin: Callable[[Indenter, Sample], int]
+    goal_mm: Callable[[Any], float]  # of the sample before it
+    begin: Callable[[Any, Any], int]  # rig and sample; the command's number
 
 
 def _moved(bench_name: str, way: Way, yes: bool, as_json: bool) -> None:
