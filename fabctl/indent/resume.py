@@ -59,9 +59,9 @@ def _told(run: RunFolder, kind: str) -> list[dict[str, int]]:
 def against_resuming(run: RunFolder, specimen: str, method: MethodConfig, bench: BenchConfig) -> list[Finding]:
     """Return what speaks against going on with `run`, as far as it is known before the rig is asked."""
     manifest = run.manifest()
-    found = begun_elsewhere(run, bench)
     if manifest.get("kind") != "indent" or manifest.get("specimen") != specimen:
-        found.append(Finding("RESUME-OTHER", f"{run.run_id} is not a test of {specimen}"))
+        return [Finding("RESUME-OTHER", f"{run.run_id} is not a test of {specimen}")]
+    found = begun_elsewhere(run, bench)
     if manifest.get("config", {}).get("method") != method.model_dump(mode="json"):
         found.append(Finding("RESUME-METHOD", "the method has changed since", hint="run it from the beginning"))
     outcome = run.outcome()

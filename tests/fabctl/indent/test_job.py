@@ -22,7 +22,7 @@ from fabctl.indent.groups import analyse_groups
 from fabctl.indent.job import IndentPlan, Steering, plan_test, refuse, run_test
 from fabctl.indent.sampling import Wish
 from fabctl.records.ending import undisturbed
-from fabctl.records.folder import RunFolder, status_of
+from fabctl.records.folder import RunFolder, start_run, status_of
 from fabctl.reports.indent_step import indent_step
 from fabctl.workspace import Specimen, Workspace
 from simulators.rig.controller import Controller, Machine
@@ -135,6 +135,8 @@ def test_a_resumed_test_stays_on_its_bench_and_its_rig(lab: Lab, monkeypatch: py
     elsewhere = BENCH.model_copy(update={"name": "there"})
     (found,) = [f for f in lab.plan(bench=elsewhere, resume=before).findings if f.level == "error"]
     assert (found.code, found.hint) == ("RESUME-BENCH", "go on there: --bench here")
+    other = start_run(lab.place.runs, "calibrate", config={"bench": "here"})
+    assert [f.code for f in lab.plan(resume=other).findings if f.level == "error"] == ["RESUME-OTHER"]
     same = Indenter.identify
     monkeypatch.setattr(Indenter, "identify", lambda rig: replace(same(rig), serial=same(rig).serial + 1))
     with pytest.raises(RefusedError, match="RESUME-RIG"):
