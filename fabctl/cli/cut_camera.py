@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
+from fabctl.cli.common import MATERIAL, F, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
 from fabctl.cli.paths import config_names
 
 if TYPE_CHECKING:
@@ -59,22 +59,25 @@ def _is_registration(path: Path) -> bool:
     return isinstance(data, dict) and "sheet" in data
 
 
+def plain_job_options(command: F) -> F:
+    """Give a command what every job that makes no specimen takes."""
+    origin = click.option(
+        "--origin",
+        type=click.Choice(["home", "here"]),
+        default="home",
+        show_default=True,
+        help="Where the job's corner lies: in the corner of the travel, or where the head is.",
+    )
+    dry_run = click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
+    return origin(dry_run(bench_option(yes_option(json_option(command)))))
+
+
 @click.command("marks")
 @click.argument("board", type=config_names("boards"))
 @click.option(
     "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives power and speed."
 )
-@click.option(
-    "--origin",
-    type=click.Choice(["home", "here"]),
-    default="home",
-    show_default=True,
-    help="Where the board's corner lies: in the corner of the travel, or where the head is.",
-)
-@click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
-@bench_option
-@yes_option
-@json_option
+@plain_job_options
 def marks_command(
     board: str, material: str, origin: str, dry_run: bool, bench_name: str, yes: bool, as_json: bool
 ) -> None:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, bench_option, json_option, lab, show, yes_option
+from fabctl.cli.common import MATERIAL, bench_option, json_option, lab, show
+from fabctl.cli.cut_camera import plain_job, plain_job_options
 from fabctl.cli.finite import numbers
 from fabctl.cli.paths import InFile, InFolder, OutFolder
 
@@ -72,22 +73,11 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
 
 @command.command("cut")
 @click.argument("folder", type=InFolder())
-@click.option(
-    "--origin",
-    type=click.Choice(["home", "here"]),
-    default="home",
-    show_default=True,
-    help="Where the coupon's corner lies: in the corner of the travel, or where the head is.",
-)
-@click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
-@bench_option
-@yes_option
-@json_option
+@plain_job_options
 def cut_coupon(folder: Path, origin: str, dry_run: bool, bench_name: str, yes: bool, as_json: bool) -> None:
     """Cut the coupon in FOLDER: the same checks, the same question and the same record as any cut."""
     from design.export.gcode import GcodeOptions
     from design.pattern.paths import LayerPreset
-    from fabctl.cli.cut_camera import plain_job
     from fabctl.config.bench import load_bench
     from fabctl.config.material import load_material
     from fabctl.cut.job import CutOrder, laser_config_of
