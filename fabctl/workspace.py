@@ -136,6 +136,12 @@ class Specimen:
         """Return the specimen's own copy of the design folder."""
         return self.path / "design"
 
+    @property
+    def is_coupon(self) -> bool:
+        """Tell whether it is a coupon: flat patches to be pulled open by hand, no surface to press."""
+        manifest = self.design / "manifest.json"
+        return manifest.is_file() and json.loads(manifest.read_text(encoding="utf-8")).get("kind") == "coupon"
+
     def record(self) -> dict[str, Any]:
         """Return what is written about the specimen."""
         path = self.path / "specimen.json"

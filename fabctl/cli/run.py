@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from fabctl.cli.common import json_option, lab, show
+from fabctl.cli.figures import figures
 from fabctl.cli.paths import RUN, SPECIMEN, OutFile
 from fabctl.records.export import export
 from fabctl.records.folder import status_of
@@ -63,7 +64,7 @@ def show_run(run: str, as_json: bool) -> None:
         f"specimen  {manifest.get('specimen') or '-'}",
         f"started   {manifest['started_utc']} by {manifest['operator']}",
         *(f"input     {item['path']}  {item['sha256'][:12]}" for item in manifest["inputs"]),
-        *(f"result    {key} = {value}" for key, value in result.items() if not isinstance(value, dict | list)),
+        *(f"result    {line}" for line in figures(result)),
         *(f"file      {name}" for name in files),
     ]
     data = {"run": found.run_id, "path": str(found.path), "status": state, "manifest": manifest, "result": result}

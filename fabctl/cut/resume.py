@@ -19,7 +19,7 @@ from design.findings import Finding, errors
 from drivers.grbl.laser import Laser
 from drivers.grbl.messages import Report, Vector
 from drivers.grbl.settings import Identity
-from fabctl.bench import Bench
+from fabctl.bench import Bench, begun_elsewhere
 from fabctl.config.bench import LaserConfig
 from fabctl.config.loader import parse
 from fabctl.config.material import MaterialConfig
@@ -152,18 +152,14 @@ def _interrupted(path: Path) -> RunFolder:
 
 def _against(before: RunFolder, bench: Bench, order: CutOrder) -> list[Finding]:
     """Return what the record has against going on here, with this material."""
-    found, config = [], before.manifest()["config"]
-    there, material = config["bench"]["name"], material_of(before).name
-    if there != bench.config.name:
-        text = f"{before.run_id} was cut on bench {there}, this is {bench.config.name}"
-        found.append(Finding("RESUME-BENCH", text, hint="resume where the sheet lies"))
+    found, material = begun_elsewhere(before, bench.config), material_of(before).name
     if order.material.name != material:
         text = f"{before.run_id} cuts {material} with the powers of its preset, not {order.material.name}"
         found.append(Finding("RESUME-MATERIAL", text, hint="leave --material out"))
     if not has_begun(before):
         text = f"{before.run_id} ended before anything was cut"
         found.append(Finding("RESUME-EMPTY", text, hint=how_to_go_on(before)))
-    if sha256(before.artefact("job.nc")) != config["plan"]["job_sha256"]:
+    if sha256(before.artefact("job.nc")) != before.manifest()["config"]["plan"]["job_sha256"]:
         text = f"the program of {before.run_id} is not the one sent"
         found.append(Finding("RESUME-PROGRAM", text, hint="cut the design anew"))
     return found

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from fabctl.records.folder import RunFolder, status_of
 from fabctl.reports.indent_step import as_svg
 from fabctl.reports.model import Fact, Figure, Step, Word
 from fabctl.reports.numbers import with_half
-
-
-def is_coupon(design: Path) -> bool:
-    """Say whether a specimen's design folder is a coupon's."""
-    manifest = design / "manifest.json"
-    return manifest.is_file() and json.loads(manifest.read_text(encoding="utf-8")).get("kind") == "coupon"
 
 
 def coupon_step(run: RunFolder) -> Step:

@@ -44,6 +44,8 @@ def indent_step(run: RunFolder, design: Path) -> Step:
     notes = tuple(f"{f['level']}: {f['message']}" for f in result.get("findings", []))
     if outcome.get("status") != "done" and outcome.get("message"):
         notes = (str(outcome["message"]), *notes)
+    if outcome.get("status") == "done" and "curves" not in result:
+        notes = (f"recorded, its figures are not computed: fabctl indent analyse {run.run_id}", *notes)
     return Step(
         "Indentation", status_of(run), summary, tuple(_facts(result, config, _started(manifest))), figures, notes,
         bool(is_simulated(manifest)),

@@ -12,7 +12,7 @@ from typing import Any
 from fabctl.coupon import KIND as READING
 from fabctl.records.folder import RunFolder, sha256, status_of
 from fabctl.records.words import is_simulated
-from fabctl.reports.coupon_step import coupon_step, coupon_verdict, is_coupon
+from fabctl.reports.coupon_step import coupon_step, coupon_verdict
 from fabctl.reports.design_step import cut_step, design_step
 from fabctl.reports.indent_step import indent_step
 from fabctl.reports.model import Fact, Provenance, Report, Step, Word
@@ -33,7 +33,7 @@ def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
     steps += [indent_step(latest["indent"], specimen.design)] if "indent" in latest else []
     steps += [scan_step(latest["scan"])] if "scan" in latest else []
     steps += [coupon_step(latest[READING])] if READING in latest else []
-    if is_coupon(specimen.design):
+    if specimen.is_coupon:
         word, sentence, reasons = coupon_verdict(latest.get(READING), latest.get("cut"))
     else:
         word, sentence, reasons = verdict(latest)
