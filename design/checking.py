@@ -66,9 +66,15 @@ def check(
     found = list(report.findings)
     design = None
     if report.best() is not None:
-        watch("laying out the sheet", 0.7)
         try:
-            design = build(replace(spec, response=None), mesh, library, presets, report=report)
+            design = build(
+                replace(spec, response=None),
+                mesh,
+                library,
+                presets,
+                lambda text, done: watch(f"the sheet: {text}", 0.6 + 0.4 * done),
+                report=report,
+            )
             found += [finding for finding in design.findings if finding not in found]
         except DesignError as fault:
             found.append(Finding("CHECK-SHEET", fault.message, "error"))

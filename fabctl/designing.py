@@ -268,6 +268,7 @@ def write_coupon(
     folder: Path, asked: CouponConfig, home: Path, replace: bool = False, emit: Emit = silent
 ) -> tuple[Coupon, Bundle]:
     """Write a coupon's folder, which is cut as a design's is; return what is drawn, and the folder."""
+    refuse_taken(folder, replace)
     material = load_material(asked.material, home)
     presets = presets_of(material)
     assert material.laser is not None
