@@ -27,6 +27,7 @@ from design.targets import vase
 
 ROOT = Path(__file__).resolve().parents[1]
 STEP_RATIO = 0.002
+SAME_ENTRY = 1e-5  # mm and rad: the digits in which maps are printed; steps are a thousand times that
 CELLS_COUNT = 20_000
 MANY_CELLS = """
 import json, resource, time
@@ -99,10 +100,10 @@ def published_figures(shared: Path, whole_map: Path | None = None) -> list[Figur
     wanted = averaged(tiling, points, faces, ratio, "published")
     wanted *= 1.75 / wanted.max()
     chosen = select(library, wanted, SelectionOptions("published"))
-    entries = {(round(t, 6), round(a, 7)) for t, a in zip(library.t_mm, library.theta_rad, strict=True)}
-    theirs = zip((10 * mine["t_over_l0_lib"]).round(6), mine["theta_rad_lib"].round(7), strict=True)
-    in_half = np.array([entry in entries for entry in theirs])
-    same = np.isclose(chosen.t_mm, 10 * mine["t_over_l0_lib"]) & np.isclose(chosen.theta_rad, mine["theta_rad_lib"])
+    theirs = np.column_stack([10 * mine["t_over_l0_lib"], mine["theta_rad_lib"]])
+    entries = cKDTree(np.column_stack([library.t_mm, library.theta_rad]))
+    in_half = entries.query(theirs)[0] < SAME_ENTRY
+    same = np.abs(np.column_stack([chosen.t_mm, chosen.theta_rad]) - theirs).max(axis=1) < SAME_ENTRY
     hits = int((same & in_half).sum())
     off = float(np.abs(chosen.expansion_ratio - wanted)[~in_half].max(initial=0.0))
     every = int(same.sum())

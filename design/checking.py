@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,10 @@ from design.findings import Finding
 from design.flatten import FeasibilityReport, Limits, feasibility
 from design.flatten.ladder import Remedy
 from design.pattern.paths import Layer, LayerPreset
-from design.pipeline import Design, Watch, build, cells_on_offer, unwatched
+from design.pipeline import Design, build, cells_on_offer
 from design.spec import DesignSpec
 from design.surface import TriMesh, boundary_loops
+from design.watch import Watch, unwatched
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,24 +51,29 @@ def check(
     mesh: TriMesh,
     library: CellLibrary,
     presets: Mapping[Layer, LayerPreset],
-    remedy: str = "none",
+    remedy: Remedy | None = None,
     watch: Watch = unwatched,
 ) -> Check:
     """Return what speaks for and against building `mesh`; a surface that does not fit is a finding, not an error.
 
-    `remedy` (`cones`, `nearest` or `both`) is tried where no single cone-free sheet fits.
+    `remedy` is tried where no single cone-free sheet fits; None: the one that the specification asks for.
     """
     curve = cells_on_offer(spec, library)[2] or selection_curve(library)
     low, high = curve.range_ratio()
     limits = Limits(low, high, spec.cell_mm)
-    report = feasibility(mesh, limits, spec.flatten, cast(Remedy, remedy), lambda done, text: watch(text, 0.6 * done))
+    asked = remedy or spec.remedy()
+    report = feasibility(mesh, limits, spec.flatten, asked, lambda done, text: watch(text, 0.6 * done))
     found = list(report.findings)
     design = None
     if report.best() is not None:
         try:
-            asked = replace(spec, response=None, infeasible=cast(Any, "report" if remedy == "none" else remedy))
             design = build(
-                asked, mesh, library, presets, lambda text, done: watch(f"the sheet: {text}", 0.6 + 0.4 * done)
+                replace(spec, response=None),
+                mesh,
+                library,
+                presets,
+                lambda text, done: watch(f"the sheet: {text}", 0.6 + 0.4 * done),
+                report=report,
             )
             found += [finding for finding in design.findings if finding not in found]
         except DesignError as fault:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,6 +29,7 @@ from design.pattern.font import Anchor, text_strokes
 from design.pattern.paths import CutPath
 from design.pattern.slits import outline_loops, slit_paths, slits_of
 from design.pattern.tiling import Array, Tiling, lattice
+from design.watch import Watch, unwatched
 
 GAP_MM = 8.0  # between patches with their tags: the sheet holds together while it is cut
 LINE_MM, BETWEEN_MM = 2.6, 1.4  # height of the tag's two lines of text, and what lies between them
@@ -87,7 +88,7 @@ def coupon(
     sheet: Sheet,
     cells_count: tuple[int, int] = (6, 6),
     border: BorderOptions = BORDER,
-    watch: Callable[[str, float], None] = lambda _message, _done_frac: None,
+    watch: Watch = unwatched,
 ) -> Coupon:
     """Return a sheet of uniform patches, one a hinge width, and what each should do when it is pulled open.
 
@@ -113,10 +114,9 @@ def coupon(
     paths += registration_marks(size, border) if border.marks else []
     first = anchors[0] if anchors else None
     solved = []
-    for k, hinge in enumerate(hinges_mm):
-        watch(f"solving a cell with hinges of {hinge:g} mm", k / len(hinges_mm))
+    for number, hinge in enumerate(hinges_mm):
+        watch(f"solving the cell with a hinge of {hinge:g} mm", number / len(hinges_mm))
         solved.append(solve_cell(t_mm, theta_rad, replace(sheet, hinge_mm=hinge)).expansion_ratio)
-    watch("writing the folder", 1.0)
     gauge_mm = sheet.edge_mm * cells_count[0]
     patches = [
         Patch(name, hinge, expansion, gauge_mm, _notches_mm(tiling, gauge_mm))

@@ -18,7 +18,7 @@ from design.pattern.drawing import Drawing
 from design.pattern.font import text_strokes
 from design.pattern.paths import CutPath, Layer, LayerPreset
 from design.pattern.sequence import sequence
-from design.pattern.toolpath import ToolOptions, strokes_of
+from design.pattern.toolpath import ToolOptions, along_mm, strokes_of
 
 RAPID_MM_S, ACCELERATION_MM_S2 = 100.0, 500.0  # of a small gantry laser, for the estimate alone
 
@@ -78,8 +78,8 @@ def compose_job(
 
 def amount(strokes: Sequence[CutPath], presets: Mapping[Layer, LayerPreset]) -> tuple[float, float, float]:
     """Return cut length and travel in mm, and an estimate of the time in s (one stop between strokes, no corners)."""
-    lengths = [float(np.linalg.norm(np.diff(s.points_mm, axis=0), axis=1).sum()) for s in strokes]
-    moves = [float(np.linalg.norm(b.points_mm[0] - a.points_mm[-1])) for a, b in pairwise(strokes)]
+    lengths = [along_mm(stroke.points_mm)[-1] for stroke in strokes]
+    moves = [math.dist(a.points_mm[-1].tolist(), b.points_mm[0].tolist()) for a, b in pairwise(strokes)]
     cutting_s = sum(_move_s(d, presets[s.layer].feed_mm_s) for d, s in zip(lengths, strokes, strict=True))
     return sum(lengths), sum(moves), cutting_s + sum(_move_s(d, RAPID_MM_S) for d in moves)
 

@@ -79,7 +79,8 @@ def _read_soup(path: Path) -> Soup:
     parse = _PARSERS.get(path.suffix.lower())
     try:
         if parse is None:
-            raise BadFile("FILE-FORMAT", f"meshes are OBJ, PLY or STL, not `{path.suffix}`")
+            kind = f"not `{path.suffix}`" if path.suffix else "and this has no ending at all"
+            raise BadFile("FILE-FORMAT", f"meshes are .obj, .ply or .stl, {kind}")
         data = path.read_bytes()
         if not data.strip():
             raise BadFile("FILE-EMPTY", "the file is empty")

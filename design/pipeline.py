@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,7 @@ from design.compensated import compensated
 from design.deploy.supports import Support
 from design.errors import OutOfLibrary
 from design.findings import Finding
-from design.flatten import Flattening, Limits, feasibility, flatten
-from design.flatten.ladder import Remedy
+from design.flatten import FeasibilityReport, Flattening, Limits, feasibility, flatten
 from design.hinged import Widening, as_cut, hinge_of, hinge_range, hinged, widening
 from design.job import Job, JobOptions, compose_job
 from design.limits import check_count
@@ -37,6 +35,7 @@ from design.pattern.tubes import period_mm, tile_tube
 from design.predicted import Predicted, predict
 from design.spec import DesignSpec, Region
 from design.surface import TriMesh
+from design.watch import Watch, unwatched
 
 SCALE_ROUNDS_COUNT = 24
 SCALE_MARGIN_RATIO = 2e-4  # kept from the end of the library, so that cells come to lie just inside it
@@ -44,12 +43,6 @@ CONTACT_FRAC = 1e-4  # of the material lying on other material: less is rounding
 HINGE_SAME_MM = 1e-6
 WIDENING_ROUNDS_COUNT, WIDENING_SAME_RATIO = 4, 1e-3  # 1e-3 of expansion moves a hinge by a micrometre
 PUBLISHED_HIGH_RATIO = 1.75  # what the published pipeline scales the greatest expansion to
-
-Watch = Callable[[str, float], None]
-
-
-def unwatched(_: str, __: float) -> None:
-    """Hear nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,17 +96,18 @@ def build(
     presets: Mapping[Layer, LayerPreset],
     watch: Watch = unwatched,
     findings: Iterable[Finding] = (),
+    report: FeasibilityReport | None = None,
 ) -> Design:
     """Return the design of `mesh`; raise a `DesignError` that carries the findings where there is none.
 
     `library` must be that of the sheet to cut, with cells of `spec.cell_mm`; `presets` say how each layer is cut;
-    `findings` are those of reading the inputs.
+    `findings` are those of reading the inputs, `report` is the ladder where it was climbed before.
     """
     watch("flattening the surface", 0.0)
     found = list(findings)
     base, library, curve, wide = cells_on_offer(spec, library)
     found += hinge_range(base, library)
-    flat = lay_flat(spec, mesh, curve, found)
+    flat = lay_flat(spec, mesh, curve, found, report)
     watch("choosing cells", 0.2)
     flat, tiling, wanted, choice = choose(spec, flat, base, curve, found, wide)
     if spec.compensate:
@@ -187,19 +181,25 @@ def contact_findings(spec: DesignSpec, choice: Choice, library: CellLibrary) -> 
     return [Finding("CELLS-CONTACT", f"{text}; they will close less than predicted", "warning")]
 
 
-def lay_flat(spec: DesignSpec, mesh: TriMesh, curve: SelectionCurve | None, found: list[Finding]) -> Flattening:
+def lay_flat(
+    spec: DesignSpec,
+    mesh: TriMesh,
+    curve: SelectionCurve | None,
+    found: list[Finding],
+    report: FeasibilityReport | None = None,
+) -> Flattening:
     """Return the flat of `mesh`, by the first rung of the ladder on which the library's range is enough.
 
     Raises `OutOfLibrary` with what the ladder found where it ends before that. Cones that the specification asks for
-    are placed without climbing, and a flat that is given is taken as it is.
+    are placed without climbing, and a flat or a rim that is given is taken as it is.
     """
-    remedy = {"report": "none"}.get(spec.infeasible, spec.infeasible)
-    if curve is None or spec.flatten.cones_count or spec.flatten.given_mm is not None:
+    given = spec.flatten.given_mm is not None or spec.flatten.boundary == "prescribed"
+    if curve is None or spec.flatten.cones_count or given:
         flat = flatten(mesh, spec.flatten)
         found += flat.findings
         return flat
     low, high = curve.range_ratio()
-    report = feasibility(mesh, Limits(low, high, spec.cell_mm), spec.flatten, cast(Remedy, remedy))
+    report = report or feasibility(mesh, Limits(low, high, spec.cell_mm), spec.flatten, spec.remedy())
     flat = report.flattening()
     found += [finding for finding in report.findings if finding not in found]
     found += [finding for finding in flat.findings if finding not in found]
@@ -284,20 +284,17 @@ def scaled_tube(
 ) -> tuple[Flattening, Tiling, Array]:
     """Return a tube's flat at the scale nearest to the wanted end at which a whole number of cells goes around."""
     low, high = limits_ratio
-    fitting = []
-    for count, scale in flat.whole_cell_scales(spec.cell_mm, 0.8, 1.25):
+    scales = flat.whole_cell_scales(spec.cell_mm, 0.8, 1.25)
+    for count, scale in sorted(scales, key=lambda item: abs(np.log(item[1]))):
         scaled_flat = flat.scaled(scale)
         tiling = tile_tube(scaled_flat, spec.cell_mm)
         points, faces, copy = scaled_flat.unrolled()
         area_ratio = scaled_flat.expansion_ratio[copy] ** 2
         wanted = averaged(tiling, points, faces, area_ratio, spec.averaging)
         if low <= wanted.min() and wanted.max() <= high:
-            fitting.append((abs(np.log(scale)), count, scaled_flat, tiling, wanted))
-    if not fitting:
-        raise OutOfLibrary(*_faces_range(flat), limits_ratio, found)
-    _, count, flat, tiling, wanted = min(fitting, key=lambda item: item[0])
-    found.append(Finding("TUBE-CELLS", f"{count} cells go around; the seam joins cell to cell", "info"))
-    return flat, tiling, wanted
+            found.append(Finding("TUBE-CELLS", f"{count} cells go around; the seam joins cell to cell", "info"))
+            return scaled_flat, tiling, wanted
+    raise OutOfLibrary(*_faces_range(flat), limits_ratio, found)
 
 
 def _faces_range(flat: Flattening) -> tuple[float, float]:

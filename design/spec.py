@@ -7,6 +7,7 @@ from typing import Literal
 
 from design.cells.select import SelectionOptions
 from design.flatten import FlattenOptions
+from design.flatten.ladder import Remedy
 from design.pattern.assign import Averaging, ScaleOptions
 from design.pattern.border import BorderOptions
 from design.pattern.slits import HingeOptions
@@ -59,3 +60,7 @@ class DesignSpec:
     bed_mm: tuple[float, float] | None = None
     compensate: bool | Rim = False  # change expansions so that the sheet at rest meets the target; a rim: under weight
     response: ResponseOptions | None = field(default_factory=ResponseOptions)
+
+    def remedy(self) -> Remedy:
+        """Return what the ladder tries where no cone-free sheet fits."""
+        return "none" if self.infeasible == "report" else self.infeasible

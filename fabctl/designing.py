@@ -21,6 +21,7 @@ from design.coupon import Coupon, coupon
 from design.export.gcode import GcodeOptions
 from design.findings import Finding
 from design.flatten.cut import chain_through
+from design.flatten.prescribed import rim_u_through
 from design.job import JobOptions, compose_job
 from design.meshfiles import read_given_flat, read_mesh
 from design.pattern.paths import Layer, LayerPreset
@@ -29,6 +30,7 @@ from design.pipeline import Design, build
 from design.spec import DesignSpec, Kind, Rim
 from design.surface import TriMesh
 from design.targets import TARGETS
+from design.watch import Watch
 from fabctl.config.bench import names
 from fabctl.config.coupon import CouponConfig
 from fabctl.config.material import LayerConfig, MaterialConfig, load_material
@@ -37,6 +39,7 @@ from fabctl.errors import RefusedError, UsageError
 from fabctl.events import Emit, Event, silent
 
 WRITING_FROM_FRAC = 0.99  # of a build: what is left is writing the folder
+COUPON_SOLVED_FRAC = 0.9  # the rest is ordering the cut and writing
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +88,9 @@ def _inputs_of(
         spec = changed(
             spec, flatten=changed(spec.flatten, cut_path=chain_through(mesh, np.array(config.flatten.cut_mm)))
         )
+    if config.flatten.rim_u is not None:
+        rows = np.array(config.flatten.rim_u)
+        spec = changed(spec, flatten=changed(spec.flatten, boundary_u=rim_u_through(mesh, rows[:, :3], rows[:, 3])))
     file = library or library_file(config, beside)
     cells = library_of(config, file).scaled(sheet)
     return Inputs(spec, keeping("library", file, text), mesh, cells, presets, tuple(findings))
@@ -127,9 +133,10 @@ def inputs_for(
         return read_inputs(target, home, None, cell_mm, library)
     if is_spec and target not in TARGETS:
         raise UsageError(f"{target}: a specification says its material and cells itself; change them there")
-    if target not in TARGETS and not Path(target).exists():
-        known = ", ".join(sorted({*TARGETS, *names("specs", home)}))
-        raise UsageError(f"{target}: no such file, nor the name of a surface or a specification (known: {known})")
+    if target not in TARGETS and not Path(target).is_file():
+        wrong = "is a folder" if Path(target).is_dir() else "there is no such file"
+        specs, surfaces = ", ".join(names("specs", home)) or "none", ", ".join(sorted(TARGETS))
+        raise UsageError(f"{target}: {wrong}, no specification ({specs}) and no surface of our own ({surfaces})")
     source: str | MadeTarget = MadeTarget(make=target) if target in TARGETS else target
     config = SpecConfig(
         name=re.sub(r"\W", "-", Path(target).stem) or "target",
@@ -143,10 +150,13 @@ def inputs_for(
 def design_of(inputs: Inputs, emit: Emit = silent) -> Design:
     """Return the design of the inputs."""
 
-    def watch(message: str, done_frac: float) -> None:
-        emit(Event("progress", message, WRITING_FROM_FRAC * done_frac))
-
+    watch = progress_of(emit, WRITING_FROM_FRAC)
     return build(inputs.spec, inputs.mesh, inputs.library, inputs.presets, watch, inputs.findings)
+
+
+def progress_of(emit: Emit, up_to_frac: float = 1.0) -> Watch:
+    """Return what the design package tells its progress to; its whole is `up_to_frac` of the command's."""
+    return lambda message, done_frac: emit(Event("progress", message, up_to_frac * done_frac))
 
 
 def build_folder(
@@ -262,14 +272,14 @@ def write_coupon(
     material = load_material(asked.material, home)
     presets = presets_of(material)
     assert material.laser is not None
+    refuse_taken(folder, replace)
     sheet = sheet_of(material, material.edge_mm)
+    emit(Event("progress", "choosing the cell", 0.0))
     library = load_library(Path(asked.library) if asked.library else None).scaled(sheet)
     cell = select(library, np.array([asked.expansion_ratio]))
-
-    def watch(message: str, done_frac: float) -> None:
-        emit(Event("progress", message, done_frac))
-
+    watch = progress_of(emit, COUPON_SOLVED_FRAC)
     made = coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), asked.hinges_mm, sheet, watch=watch)
+    watch("writing the coupon's folder", 1.0)
     job = compose_job(made.drawing, presets, job_options(asked.tool, material.laser.kerf_mm), remarks=[asked.name])
     text = yaml.safe_dump(asked.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
     return made, write_coupon_bundle(made, job, text, library.hash, sheet.edge_mm, folder, replace)

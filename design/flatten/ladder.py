@@ -59,7 +59,7 @@ class FeasibilityReport:
 
     limits: Limits
     steps: tuple[Step, ...]
-    bound_ratio: float | None  # no cone-free single sheet spreads less; None where it was not asked for
+    bound_ratio: float | None  # no cone-free single sheet spreads less; None where none was asked for or found
     proven_infeasible: bool
     scale_ratio: float  # factor on the rim step's flat that places its expansions best in the library
     excess_log: Values  # (m,) ln of the part outside: positive above the range, negative below, 0 within
@@ -132,20 +132,24 @@ def feasibility(
     emit(0.2, "looking for a proof")
     is_tube = any(seam.closes_tube for seam in placed.seams)
     bound_ratio = _bound(mesh, placed, limits, is_tube)
-    proven = bound_ratio > limits.range_ratio()
+    proven = bound_ratio is not None and bound_ratio > limits.range_ratio()
     found = [*_verdict(steps, limits), *_where(mesh, excess_log), _proof_finding(bound_ratio, proven, limits, is_tube)]
     if remedy in ("cones", "both"):
         steps += _try_cones(mesh, limits, asked, emit, found)
-    near = _try_nearest(mesh, limits, asked, emit, found) if remedy in ("nearest", "both") else None
+    seam = replace(asked, seam="tube") if is_tube else asked  # decided: not to be tried as a disk at every stage
+    near = _try_nearest(mesh, limits, seam, emit, found) if remedy in ("nearest", "both") else None
     if near is not None:
         detail = f"the surface was moved by {near.rms_mm:.2f} mm RMS ({near.rms_ratio:.2%} of its diagonal)"
         steps.append(_step("nearest", near.flattening, limits, detail))
     return FeasibilityReport(limits, tuple(steps), bound_ratio, proven, scale_ratio, excess_log, near, tuple(found))
 
 
-def _bound(mesh: TriMesh, placed: Flattening, limits: Limits, is_tube: bool) -> float:
-    """Return the proven bound, less what this mesh's faces may differ from its scale factors."""
-    bound = proven_bound(mesh, boundary_loops(mesh), limits.cell_mm, is_tube).spread_ratio
+def _bound(mesh: TriMesh, placed: Flattening, limits: Limits, is_tube: bool) -> float | None:
+    """Return the proven bound, less what this mesh's faces may differ from its scale factors; None without a proof."""
+    try:
+        bound = proven_bound(mesh, boundary_loops(mesh), limits.cell_mm, is_tube).spread_ratio
+    except NotConverged:
+        return None
     by_faces = np.log(placed.spread_ratio())
     by_scale_factors = np.ptp(placed.u)
     return float(bound * np.exp(-max(ALLOWANCE_log, abs(by_faces - by_scale_factors))))
@@ -205,8 +209,10 @@ def _where(mesh: TriMesh, excess_log: Values) -> list[Finding]:
     return found
 
 
-def _proof_finding(bound_ratio: float, proven: bool, limits: Limits, is_tube: bool) -> Finding:
+def _proof_finding(bound_ratio: float | None, proven: bool, limits: Limits, is_tube: bool) -> Finding:
     sheet = "sheet with one seam and no cones" if is_tube else "single sheet without cones"
+    if bound_ratio is None:
+        return Finding("FIT-UNPROVEN", f"not proven: no bound was found on what a {sheet} can do", "warning")
     if proven:
         text = f"proven: no {sheet} can do with less than {bound_ratio:.3f}; the library has {limits.range_ratio():.3f}"
         return Finding("FIT-PROVEN", text)

@@ -106,10 +106,20 @@ def _solve(base: Values, columns: Values, limits: Limits, equal: Equations | Non
     cost = np.zeros(columns.shape[1] + 2)
     cost[-2:] = -1, 1
     A_eq, b_eq = (np.pad(equal[0], ((0, 0), (0, 2))), equal[1]) if equal else (None, None)
-    answer = linprog(cost, A, b, A_eq, b_eq, [*limits, (None, None), (None, None)], method="highs")
-    if not answer.success:
-        raise NotConverged("the boundary programme", float("nan"), int(answer.nit), answer.message)
-    return answer
+    bounds = [*limits, (None, None), (None, None)]
+    return _solved("the boundary programme", c=cost, A_ub=A, b_ub=b, A_eq=A_eq, b_eq=b_eq, bounds=bounds)
+
+
+def _solved(name: str, **programme: Any) -> Any:
+    """Return the programme's answer; raise `NotConverged` where it has none.
+
+    HiGHS's presolve gives up on some well-posed ones (equations of nearly equal coefficients), so they are tried whole.
+    """
+    for presolve in (True, False):
+        answer: Any = linprog(**programme, method="highs", options={"presolve": presolve})
+        if answer.success:
+            return answer
+    raise NotConverged(name, float("nan"), int(answer.nit), answer.message)
 
 
 def _certificate(
@@ -163,9 +173,8 @@ def _gentlest(
         cost = np.concatenate([np.zeros(k), roughness, [0.0]])
         A_eq, b_eq = (np.pad(equal[0], ((0, 0), (0, k + 1))), equal[1]) if equal else (None, None)
         bounds = [*limits, *[(0, None)] * k, (None, None)]
-        answer: Any = linprog(cost, A, b, A_eq, b_eq, bounds, method="highs")
-        if not answer.success:
-            raise NotConverged("the gentle boundary programme", float("nan"), int(answer.nit), answer.message)
+        name = "the gentle boundary programme"
+        answer = _solved(name, c=cost, A_ub=A, b_ub=b, A_eq=A_eq, b_eq=b_eq, bounds=bounds)
         low = answer.x[-1]
         missed = np.setdiff1d(_worst(base + columns @ answer.x[:k], low, low + spread), rows)
         if len(missed) == 0:

@@ -26,12 +26,15 @@ KICK_COUNT = 30  # strokes in a run that a kick moves at most
 KICK_CHAIN_COUNT, KICK_FIRST_COUNT = 6, 2  # the same while a kick is repaired
 KICK_REACH_COUNT = 1000  # ends turned around in one exchange while a kick is repaired: more costs more than it gains
 KICKS_LIMIT_COUNT = 3000  # half a second, on 20,000 strokes a fifth of the whole
+# Ends turned around, three seconds' work; then chains reach no farther than a kick's repair. Not timed, but counted:
+TURNED_LIMIT_COUNT = 2_500_000_000  # the same strokes have the same order on every machine.
 GAIN_MM = 1e-7  # less is rounding
 
 
 def tour(
-    ends_mm: Array, start_mm: tuple[float, float] = (0.0, 0.0), kicks_count: int | None = None, seed: int = 0
-) -> Index:
+    ends_mm: Array, start_mm: tuple[float, float] = (0.0, 0.0), kicks_count: int | None = None, seed: int = 0,
+    turned_limit_count: int = TURNED_LIMIT_COUNT,
+) -> Index:  # fmt: skip
     """Return the strokes' ends in the order they are met, `(2n,)`: stroke k has the ends 2k and 2k + 1.
 
     `ends_mm` is `(2n, 2)`. The tour leaves from `start_mm` and comes back to it. `kicks_count` None means as many as
@@ -47,7 +50,7 @@ def tour(
     points = np.ascontiguousarray(points[first])
     order = np.arange(len(first))
     kicks = kicks_count if kicks_count is not None else min(10 * count, KICKS_LIMIT_COUNT)
-    _improve(points, _near(points), order, kicks, seed)
+    _improve(points, _near(points), order, kicks, seed, turned_limit_count)
     order = first[order]
     at = int(np.flatnonzero(order >= 2 * count)[0])
     # The two home ends are neighbours; at an even place, because strokes stay whole.
@@ -99,8 +102,8 @@ def _mate(order: Index, pos: Index, v: int) -> Any:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _reverse(order: Index, pos: Index, i: int, j: int) -> None:
-    """Run the whole strokes from position i to j (cyclic) the other way; or all the others, which is the same tour."""
+def _reverse(order: Index, pos: Index, i: int, j: int) -> Any:
+    """Turn the whole strokes from position i to j (cyclic) around, or all others: the same tour; return how many."""
     n = len(order)
     inside = (j - i) % n + 1
     if 2 * inside > n:
@@ -116,6 +119,7 @@ def _reverse(order: Index, pos: Index, i: int, j: int) -> None:
         j -= 1
         if j < 0:
             j = n - 1
+    return inside
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -123,15 +127,12 @@ def _link(points: Array, order: Index, pos: Index, log: Index, a: int, c: int) -
     """Link `a` with `c`, and their mates b and d with each other; return by how much the tour grew.
 
     Both must leave strokes, or both enter them. `log[0, 0]` counts the entries (a, b) after it: linking those again,
-    the last first, takes everything back.
+    the last first, takes everything back. `log[0, 1]` counts down the ends that may still be turned at length.
     """
     n = len(order)
     b, d = _mate(order, pos, a), _mate(order, pos, c)
     p, q = pos[a], pos[c]
-    if p % 2:
-        _reverse(order, pos, (p + 1) % n, q)
-    else:
-        _reverse(order, pos, p, (q - 1) % n)
+    log[0, 1] -= _reverse(order, pos, (p + 1) % n, q) if p % 2 else _reverse(order, pos, p, (q - 1) % n)
     log[0, 0] += 1
     log[log[0, 0], 0], log[log[0, 0], 1] = a, b
     return _gap(points, a, c) + _gap(points, b, d) - _gap(points, a, b) - _gap(points, c, d)
@@ -332,9 +333,10 @@ def _settle(
             if top[FIRST_COUNT] > GAIN_MM:
                 gain = top[FIRST_COUNT]
                 _exchange(points, order, pos, log, v, ends[FIRST_COUNT, 0], ends[FIRST_COUNT, 1])
+        far = reach if log[0, 1] > 0 else min(reach, KICK_REACH_COUNT)
         for first in range(firsts):
             if gain == 0.0:
-                gain = _chain(points, near, order, pos, log, v, first, reach, chain, top, ends)
+                gain = _chain(points, near, order, pos, log, v, first, far, chain, top, ends)
         if gain > 0.0:
             total += gain
             for k in range(begun + 1, log[0, 0] + 1):
@@ -354,7 +356,7 @@ def _await(order: Index, pos: Index, queue: Index, waiting: NDArray[np.bool_], v
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _improve(points: Array, near: NDArray[np.int32], order: Index, kicks: int, seed: int) -> None:
+def _improve(points: Array, near: NDArray[np.int32], order: Index, kicks: int, seed: int, turned_limit: int) -> None:
     """Better the tour in place."""
     n = len(order)
     np.random.seed(seed)
@@ -362,6 +364,7 @@ def _improve(points: Array, near: NDArray[np.int32], order: Index, kicks: int, s
     for k in range(n):
         pos[order[k]] = k
     log = np.zeros((16384, 2), np.int64)
+    log[0, 1] = turned_limit
     queue = np.zeros(n + 2, np.int64)
     waiting = np.zeros(n, np.bool_)
     length = 0.0

@@ -95,8 +95,15 @@ class Place:
     def put(self, flat_mm: Array) -> Array:
         """Return the flat's points as they lie under the lattice, `(n, 2)`."""
         centre = _box_centre(flat_mm)
+        return np.asarray((flat_mm - centre) @ self._turn() + centre)
+
+    def back(self, way_mm: Array) -> Array:
+        """Return directions under the lattice as they are on the unturned flat, `(…, 2)`."""
+        return np.asarray(way_mm @ self._turn().T)
+
+    def _turn(self) -> Array:
         c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
-        return np.asarray((flat_mm - centre) @ np.array([[c, s], [-s, c]]) + centre)
+        return np.array([[c, s], [-s, c]])
 
 
 def _box_centre(points_mm: Array) -> Array:
@@ -143,8 +150,15 @@ def _well_held(cells: Index, vertices_count: int) -> NDArray[np.bool_]:
 
 
 def region_of(flat_mm: Array, faces: Index) -> shapely.Geometry:
-    """Return the flat's area as a polygon with its holes, from the mesh's border loops."""
-    region = shapely.union_all(shapely.polygons(flat_mm[faces]))
+    """Return the flat's area as polygons with their holes; its faces must not overlap."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = (faces[:, :2].ravel(), faces[:, 1:].ravel())
+    pieces = connected_components(coo_array((np.ones(len(ends[0])), ends), shape=2 * (len(flat_mm),)))[1][faces[:, 0]]
+    # Within a piece faces share their corners exactly; copies of a tube's meet along sides that were computed twice.
+    parts = [shapely.coverage_union_all(shapely.polygons(flat_mm[faces[pieces == k]])) for k in np.unique(pieces)]
+    region = shapely.union_all(parts)
     shapely.prepare(region)
     return region
 
@@ -156,9 +170,9 @@ def best_place(flat_mm: Array, faces: Index, edge_mm: float) -> tuple[Place, flo
     flat's border only; the cells counted are those that `tile` would keep.
     """
     best, least = Place(), math.inf
+    picture = _Picture.of(flat_mm, faces, edge_mm)
     for turn in np.arange(TURNS_COUNT) * (math.pi / 3 / TURNS_COUNT):
-        turned = Place(turn_rad=float(turn)).put(flat_mm)
-        judge = _Judge.of(turned, faces, edge_mm)
+        judge = _Judge.of(picture, flat_mm, Place(turn_rad=float(turn)), edge_mm)
         for b in range(SHIFTS_COUNT):
             for a in range(SHIFTS_COUNT):
                 shift = ((a + b / 2) * edge_mm / SHIFTS_COUNT, b * ROW_RATIO * edge_mm / SHIFTS_COUNT)
@@ -169,20 +183,17 @@ def best_place(flat_mm: Array, faces: Index, edge_mm: float) -> tuple[Place, flo
 
 
 @dataclass(frozen=True, slots=True)
-class _Judge:
-    """A picture of the flat, and the lattice's cells of which the border decides."""
+class _Picture:
+    """Which pixels lie on the flat, and how deep, all around too; taken once, because the lattice can be turned."""
 
-    lattice: Tiling
-    inside: NDArray[np.bool_]  # (h, w) pixels
+    inside: NDArray[np.bool_]  # (h, w)
+    depth_mm: Array  # (h, w) to the flat's border, negative outside
     origin_mm: Array
     pixel_mm: float
-    deep: NDArray[np.bool_]  # (k,) cells under the flat whatever the shift
-    near: Index  # cells that a shift may bring in or out
-    samples_mm: Array  # (near, s, 2) points spread evenly over each
 
     @classmethod
-    def of(cls, flat_mm: Array, faces: Index, edge_mm: float) -> _Judge:
-        """Return the judge of one turn of the flat."""
+    def of(cls, flat_mm: Array, faces: Index, edge_mm: float) -> _Picture:
+        """Return the picture of a flat with five edges of room around it."""
         from scipy.ndimage import distance_transform_edt
 
         low, high = flat_mm.min(axis=0) - 5 * edge_mm, flat_mm.max(axis=0) + 5 * edge_mm
@@ -190,33 +201,60 @@ class _Judge:
         x, y = (np.arange(low[k], high[k], pixel) for k in (0, 1))
         inside = np.atleast_2d(shapely.contains_xy(region_of(flat_mm, faces), *np.meshgrid(x, y)))
         depth_mm: Array = pixel * np.asarray(distance_transform_edt(inside) - distance_transform_edt(~inside))
-        whole = lattice(flat_mm.min(axis=0), flat_mm.max(axis=0), edge_mm)
-        at = np.rint((whole.centres_mm() - low) / pixel).astype(np.int64)
-        at = np.clip(at, 0, np.array(inside.shape[::-1]) - 1)
-        depth = depth_mm[at[:, 1], at[:, 0]]
-        reach = 2.5 * edge_mm  # a shift of up to an edge and a half, and the cell's own size
-        near = np.flatnonzero(np.abs(depth) < reach)
-        return cls(whole, inside, low, pixel, depth >= reach, near, _samples(whole, near))
+        return cls(inside, depth_mm, low, pixel)
 
-    def misfit_ratio(self, shift_mm: Array) -> float:
-        """Return the misfit with the lattice moved by `shift_mm`."""
-        keep = self.deep.copy()
-        keep[self.near] = self._look(self.lattice.vertices_mm[self.lattice.cells[self.near]].mean(axis=1) + shift_mm)
-        kept = np.flatnonzero(keep)
-        kept = kept[_well_held(self.lattice.cells[kept], len(self.lattice.vertices_mm))]
-        border = np.isin(self.near, kept, assume_unique=True)
-        covered = self._look(self.samples_mm[border] + shift_mm)
-        cell_mm2 = ROW_RATIO / 2 * self.lattice.edge_mm**2
-        flat_mm2 = float(self.inside.sum()) * self.pixel_mm**2
-        over_mm2 = float((~covered).mean(axis=1).sum()) * cell_mm2
-        under_mm2 = len(kept) * cell_mm2 - over_mm2
-        return (flat_mm2 - under_mm2 + over_mm2) / flat_mm2
-
-    def _look(self, points_mm: Array) -> NDArray[np.bool_]:
+    def look(self, points_mm: Array) -> NDArray[np.bool_]:
+        """Return which points `(…, 2)` lie on the flat."""
         at = np.rint((points_mm - self.origin_mm) / self.pixel_mm).astype(np.int64)
         on = ((at >= 0) & (at < self.inside.shape[::-1])).all(axis=-1)
         at = np.where(np.asarray(on)[..., None], at, 0)
         return np.asarray(self.inside[at[..., 1], at[..., 0]] & on)
+
+    def depths_mm(self, points_mm: Array) -> Array:
+        """Return how deep points lie; beyond the picture, as deep as its rim."""
+        at = np.rint((points_mm - self.origin_mm) / self.pixel_mm).astype(np.int64)
+        at = np.clip(at, 0, np.array(self.inside.shape[::-1]) - 1)
+        return np.asarray(self.depth_mm[at[:, 1], at[:, 0]])
+
+
+@dataclass(frozen=True, slots=True)
+class _Judge:
+    """A lattice turned over the picture, and the cells of which the flat's border decides."""
+
+    picture: _Picture
+    lattice: Tiling
+    place: Place
+    deep: NDArray[np.bool_]  # (k,) cells under the flat whatever the shift
+    near: Index  # cells that a shift may bring in or out
+    samples_mm: Array  # (near, s, 2) points spread evenly over each
+
+    @classmethod
+    def of(cls, picture: _Picture, flat_mm: Array, place: Place, edge_mm: float) -> _Judge:
+        """Return the judge of one turn of the flat: the flat stays, the lattice is turned back."""
+        turned = place.put(flat_mm)
+        whole = lattice(turned.min(axis=0), turned.max(axis=0), edge_mm)
+        centre = _box_centre(flat_mm)
+        whole = replace(whole, vertices_mm=place.back(whole.vertices_mm - centre) + centre)
+        depth = picture.depths_mm(whole.centres_mm())
+        reach = 2.5 * edge_mm  # a shift of up to an edge and a half, and the cell's own size
+        near = np.flatnonzero(np.abs(depth) < reach)
+        return cls(picture, whole, place, depth >= reach, near, _samples(whole, near))
+
+    def misfit_ratio(self, shift_mm: Array) -> float:
+        """Return the misfit with the lattice moved by `shift_mm`."""
+        shift = self.place.back(shift_mm)
+        keep = self.deep.copy()
+        middles = self.lattice.vertices_mm[self.lattice.cells[self.near]].mean(axis=1)
+        keep[self.near] = self.picture.look(middles + shift)
+        kept = np.flatnonzero(keep)
+        kept = kept[_well_held(self.lattice.cells[kept], len(self.lattice.vertices_mm))]
+        border = np.isin(self.near, kept, assume_unique=True)
+        covered = self.picture.look(self.samples_mm[border] + shift)
+        cell_mm2 = ROW_RATIO / 2 * self.lattice.edge_mm**2
+        flat_mm2 = float(self.picture.inside.sum()) * self.picture.pixel_mm**2
+        over_mm2 = float((~covered).mean(axis=1).sum()) * cell_mm2
+        under_mm2 = len(kept) * cell_mm2 - over_mm2
+        return (flat_mm2 - under_mm2 + over_mm2) / flat_mm2
 
 
 def _samples(tiling: Tiling, cells: Index) -> Array:

@@ -6,8 +6,10 @@ a width, so it must run half of that beside an edge, and end half of that before
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -88,9 +90,9 @@ def _slit(path: CutPath, options: ToolOptions) -> list[CutPath]:
 
 def _shortened(path: CutPath, by_mm: float) -> Array:
     """Return the slit with `by_mm` taken off its inner ends, which the beam's own radius burns."""
-    length = float(np.linalg.norm(np.diff(path.points_mm, axis=0), axis=1).sum())
-    end_mm = length if path.opens else length - by_mm
-    return _between(path.points_mm, by_mm, end_mm) if end_mm > by_mm else path.points_mm
+    along = along_mm(path.points_mm)
+    end_mm = along[-1] if path.opens else along[-1] - by_mm
+    return _between(path.points_mm, along, by_mm, end_mm) if end_mm > by_mm else path.points_mm
 
 
 def _contour(path: CutPath, waste_side: int, options: ToolOptions) -> list[CutPath]:
@@ -160,21 +162,28 @@ def _lead_in(ring_mm: Array, waste_side: int, length_mm: float) -> Array:
 
 def _first_mm(line_mm: Array, length_mm: float) -> Array:
     """Return the beginning of a polyline, `length_mm` long."""
-    return _between(line_mm, 0.0, length_mm)
+    return _between(line_mm, along_mm(line_mm), 0.0, length_mm)
 
 
-def _between(line_mm: Array, start_mm: float, end_mm: float) -> Array:
-    """Return the part of a polyline between two distances along it."""
-    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line_mm, axis=0), axis=1))]
-    end_mm = min(end_mm, float(along[-1]))
-    inside = (along > start_mm + 1e-9) & (along < end_mm - 1e-9)
-    marks = np.r_[start_mm, along[inside], end_mm]
-    return np.column_stack([np.interp(marks, along, line_mm[:, k]) for k in (0, 1)])
+def along_mm(line_mm: Array) -> list[float]:
+    """Return how far along a polyline each of its points lies; in plain numbers, because most lines have three."""
+    found = [0.0]
+    for a, b in pairwise(line_mm.tolist()):
+        found.append(found[-1] + math.dist(a, b))
+    return found
+
+
+def _between(line_mm: Array, along: Sequence[float], start_mm: float, end_mm: float) -> Array:
+    """Return the part of a polyline between two distances along it; `along` says how far its points lie."""
+    marks = [start_mm, *(s for s in along if start_mm + 1e-9 < s < end_mm - 1e-9), min(end_mm, along[-1])]
+    found = np.empty((len(marks), 2))
+    found[:, 0], found[:, 1] = np.interp(marks, along, line_mm[:, 0]), np.interp(marks, along, line_mm[:, 1])
+    return found
 
 
 def _tabbed(loop_mm: Array, options: ToolOptions) -> list[Array]:
     """Return the loop as pieces with gaps between, so that bridges of `tab_mm` hold the piece in the sheet."""
-    length = float(np.linalg.norm(np.diff(loop_mm, axis=0), axis=1).sum())
+    length = along_mm(loop_mm)[-1]
     pitch = length / options.tabs_count
     bare = options.tab_mm + options.kerf_mm  # the beam burns half a kerf into the bridge from each end
     if pitch <= bare:
@@ -182,5 +191,6 @@ def _tabbed(loop_mm: Array, options: ToolOptions) -> list[Array]:
             f"{options.tabs_count} tabs of {options.tab_mm:g} mm do not fit on {length:.1f} mm of outline"
         )
     twice = np.vstack([loop_mm, loop_mm[1:]])
+    along = along_mm(twice)
     starts = pitch * (np.arange(options.tabs_count) + 0.5) + bare / 2
-    return [_between(twice, start, start + pitch - bare) for start in starts]
+    return [_between(twice, along, start, start + pitch - bare) for start in starts.tolist()]

@@ -78,8 +78,8 @@ def build(
 @library_option
 @click.option("--cells", type=click.Choice(["expanding", "contracting"]),
               help="Kind of cells, for a mesh or surface [expanding].")  # fmt: skip
-@click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]), default="none", show_default=True,
-              help="What to try where no single sheet fits.")  # fmt: skip
+@click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]),
+              help="What to try where no single sheet fits [the specification's, or none].")  # fmt: skip
 @click.option("--picture", type=PictureFile((".png",)), help="PNG of where the surface does not fit.")
 @json_option
 def check(
@@ -88,7 +88,7 @@ def check(
     cell_mm: float | None,
     library: Path | None,
     cells: str | None,
-    remedy: str,
+    remedy: str | None,
     picture: Path | None,
     as_json: bool,
 ) -> None:
@@ -99,18 +99,14 @@ def check(
     """
     from design.checking import check as checked
     from design.checking import misfit_png
-    from fabctl.designing import inputs_for
+    from fabctl.designing import inputs_for, progress_of
     from fabctl.errors import DONE, REFUSED
     from fabctl.records.folder import write_atomically
 
     listen = progress()
     listen(Event("stage", f"reading {target} and the library of cells"))
     inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
-
-    def watch(message: str, done_frac: float) -> None:
-        listen(Event("progress", message, done_frac))
-
-    found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, remedy, watch)
+    found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, cast(Any, remedy), progress_of(listen))
     if picture is not None:
         write_atomically(picture, misfit_png(inputs.mesh, found.report, inputs.spec.name))
     findings = [*inputs.findings, *found.findings]
@@ -125,8 +121,7 @@ def check(
         lines.append(
             f"{step.rung:8} spread {step.spread_ratio:.3f}  {'fits' if step.fits else 'too much'}: {step.detail}"
         )
-    if found.report.proven_infeasible:
-        lines.append(f"proven: no single sheet without cones can spread by less than {found.report.bound_ratio:.3f}")
+    lines += [finding.message for finding in found.report.findings if finding.code == "FIT-PROVEN"]
     if found.design is not None:
         width, height = found.design.drawing.size_mm
         minutes = found.design.job.time_s / 60
@@ -136,6 +131,8 @@ def check(
         )
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
+    if found.report.best() is None and (remedy or inputs.spec.remedy()) == "none":
+        lines.append("--remedy both tries cones, and the nearest surface that fits")
     facts = {"target": target, "fits": fits, **found.as_dict()}
     show(facts, as_json, lines, DONE if fits else REFUSED, f"{target}: no single sheet fits it as it is")
 
@@ -148,11 +145,8 @@ def compare(a: Path, b: Path, as_json: bool) -> None:
     """Compare two design folders: sheet, cells, cutting, deployed shape and stiffness."""
     from design.bundle import open_bundle
     from design.compared import compare as compared
+    from design.compared import compared_lines
 
     say(f"reading {a} and {b}")
     found = compared(open_bundle(a), open_bundle(b))
-    lines = [f"{'':24} {a.name:>14} {b.name:>14}   B over A"]
-    for name, ratio in found["b_over_a_ratio"].items():
-        lines.append(f"{name:24} {found['a'][name]:14.5g} {found['b'][name]:14.5g} {ratio:10.3f}")
-    lines.append(f"{found['cells_at_the_same_place_count']} cells lie at the same place in both")
-    show(found, as_json, lines)
+    show(found, as_json, [f"A: {a}", f"B: {b}", *compared_lines(found)])

@@ -91,7 +91,7 @@ def find(kind: str, name: str, home: Path) -> Path:
             return path
     wrong = "is a folder" if direct.is_dir() else "is no YAML file" if direct.is_file() else "no such file"
     known = ", ".join(names(kind, home)) or "none"
-    raise ConfigError([f"{name}: {wrong}, nor a name in configs/{kind} (known: {known})"])
+    raise ConfigError([f"{name}: {wrong}, and no name in configs/{kind} (known: {known})"])
 
 
 def names(kind: str, home: Path) -> list[str]:

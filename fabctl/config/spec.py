@@ -24,6 +24,7 @@ Length = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 Count = Annotated[int, Field(ge=0)]
 Point = tuple[float, float, float]
+RimValue = tuple[float, float, float, Annotated[float, Field(ge=-1, le=1)]]  # u: log of flat over deployed length
 
 
 class MadeTarget(Model):
@@ -53,11 +54,14 @@ class FlattenConfig(Model):
     seam: SeamChoice = "auto"
     cut_mm: Annotated[tuple[Point, ...], Field(min_length=2)] | None = None
     cones_count: Count = 0
+    rim_u: Annotated[tuple[RimValue, ...], Field(min_length=1)] | None = None  # x, y, z on the target in mm, and u
 
     @model_validator(mode="after")
-    def _no_values_here(self) -> FlattenConfig:
-        if self.boundary == "prescribed":
-            raise ValueError("a prescribed boundary needs values per vertex; it is for programs, not for this file")
+    def _values_where_prescribed(self) -> FlattenConfig:
+        if (self.boundary == "prescribed") != (self.rim_u is not None):
+            raise ValueError("`rim_u` (rows of x, y, z, u) belongs to `boundary: prescribed`, and to nothing else")
+        if self.rim_u is not None and (self.cones_count or self.cut_mm is not None):
+            raise ValueError("`rim_u` goes with neither `cones_count` nor `cut_mm`, which make rims of their own")
         return self
 
     @model_validator(mode="after")
@@ -187,7 +191,7 @@ class SpecConfig(Model):
             name=self.name,
             cells=self.cells,
             cell_mm=cell_mm,
-            flatten=FlattenOptions(**self.flatten.model_dump(exclude={"source", "cut_mm"})),
+            flatten=FlattenOptions(**self.flatten.model_dump(exclude={"source", "cut_mm", "rim_u"})),
             infeasible=self.infeasible,
             averaging=self.averaging,
             scale=ScaleOptions(self.scale.end, self.scale.high_ratio),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from design.cells.library import load_library
@@ -29,6 +31,17 @@ def test_a_surface_that_no_sheet_can_become_is_proven_so_and_pictured() -> None:
     assert found.report.proven_infeasible
     assert {"FIT-PROVEN", "FIT-WHERE"} <= {finding.code for finding in found.findings}
     assert misfit_png(mesh, found.report, "spike").startswith(b"\x89PNG")
+
+
+def test_the_remedy_is_the_specifications_own_and_the_ladder_is_climbed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def again(*_: object) -> None:
+        raise AssertionError("climbed twice")
+
+    monkeypatch.setattr("design.pipeline.feasibility", again)
+    steep = cap(radius_mm=60, half_angle_rad=1.45, edge_mm=6)
+    assert check(SPEC, steep, load_library(), PRESETS).design is None
+    found = check(replace(SPEC, infeasible="nearest"), steep, load_library(), PRESETS)
+    assert found.report.nearest is not None and found.design is not None
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from design.bundle import write_bundle
 from design.cells.library import load_library
-from design.compared import compare
+from design.compared import compare, compared_lines
 from design.pattern.paths import LAYERS, LayerPreset
 from design.pipeline import build
 from design.spec import DesignSpec, Region
@@ -29,6 +29,11 @@ def test_passive_cells_are_not_cut_and_a_comparison_counts_what_is_shared(tmp_pa
     assert found["cells_at_the_same_place_count"] == len(plain.cells.kind)
     assert found["largest_difference_t_mm"] == 0
     assert "target.ply" in found["same_files"]
+    told = "\n".join(compared_lines(found))
+    for words in ("sheet width, mm", "cutting time, min", "cut, m", "t 0 mm", "both from the same library"):
+        assert words in told
+    assert not any(f"{key} " in told for key in found["a"])
+    assert "off the target" not in told  # neither design was deployed
 
 
 def test_a_sheet_larger_than_the_bed_is_said_so() -> None:

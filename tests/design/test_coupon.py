@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -115,6 +116,16 @@ def test_hinges_that_leave_no_slit_or_no_letter_are_refused(hinges: list[float])
     cell = select(load_library(), np.array([1.5]))
     with pytest.raises(DesignError):
         coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), hinges, Sheet(), (COLUMNS, ROWS))
+
+
+def test_a_coupon_tells_which_hinge_is_being_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("design.coupon.solve_cell", lambda *_: SimpleNamespace(expansion_ratio=1.5))
+    told: list[tuple[str, float]] = []
+    cell = select(load_library(), np.array([1.5]))
+    place = float(cell.t_mm[0]), float(cell.theta_rad[0])
+    coupon(*place, [0.25, 0.4], Sheet(), (COLUMNS, ROWS), watch=lambda *event: told.append(event))
+    assert [done_frac for _, done_frac in told] == [0.0, 0.5]
+    assert "0.4 mm" in told[1][0]
 
 
 def test_a_sheet_that_there_is_not_is_told_with_those_there_are(folder: Bundle) -> None:

@@ -15,7 +15,7 @@ from design.flatten.bound import proven_bound
 from design.flatten.ladder import outside_log, placement
 from design.flatten.quality import signed_areas_mm2
 from design.meshfiles import read_mesh
-from design.surface import boundary_loops, check_target
+from design.surface import TriMesh, boundary_loops, check_target
 from design.targets import cap, freeform, hemisphere, pierced_cap, spike, vase
 
 PAPER = Limits(1.129, 1.775)  # the published library's range
@@ -132,3 +132,44 @@ def test_placement_puts_what_fits_in_the_middle_and_shares_what_does_not() -> No
     assert outside_log(np.array([1.0, 4.0]) / wide, Limits(1.0, 2.0)) == pytest.approx(
         np.log(2) / 2 * np.array([-1, 1]), abs=0.01
     )
+
+
+def wavy_tube() -> TriMesh:
+    """Return a surface of revolution with two ends, all rings alike: its programme's equations nearly repeat."""
+    around, up = np.meshgrid(np.arange(80), np.linspace(0, 1, 40))
+    radius, turn = 35 + 12 * np.sin(1.98 * np.pi * up + 0.3), around * np.pi / 40
+    points = np.stack([radius * np.cos(turn), radius * np.sin(turn), 156 * up], axis=-1).reshape(-1, 3)
+    here = np.arange(39 * 80)
+    beside = here // 80 * 80 + (here + 1) % 80
+    lower, upper = np.column_stack([here, beside, beside + 80]), np.column_stack([here, beside + 80, here + 80])
+    return TriMesh(points, np.vstack([lower, upper]))
+
+
+def test_a_programme_that_presolving_gives_up_on_is_solved_whole() -> None:
+    report = feasibility(wavy_tube(), Limits(1.158, 1.775))
+    assert report.best() is None
+    assert report.proven_infeasible
+    assert report.bound_ratio is not None and 1.9 < report.bound_ratio <= report.steps[-1].spread_ratio
+
+
+def test_a_proof_that_cannot_be_computed_leaves_the_rest_of_the_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise NotConverged("the boundary programme", math.nan, 0)
+
+    monkeypatch.setattr("design.flatten.ladder.proven_bound", fails)
+    report = feasibility(hemisphere(edge_mm=12), PAPER)
+    assert report.bound_ratio is None and not report.proven_infeasible
+    assert "FIT-UNPROVEN" in {finding.code for finding in report.findings}
+
+
+def test_what_is_laid_flat_as_a_tube_is_searched_near_as_a_tube(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[FlattenOptions] = []
+
+    def listens(_mesh: TriMesh, _limit: float, options: FlattenOptions, _emit: object) -> None:
+        asked.append(options)
+        raise NotConverged("the search for a feasible surface", 1.0, 40)
+
+    monkeypatch.setattr("design.flatten.ladder.closest_feasible", listens)
+    feasibility(wavy_tube(), Limits(1.158, 1.775), remedy="nearest")
+    feasibility(hemisphere(edge_mm=12), PAPER, remedy="nearest")
+    assert [options.seam for options in asked] == ["tube", "auto"]

@@ -87,6 +87,13 @@ def test_a_name_that_is_a_specification_is_checked_as_it_would_be_built(tmp_path
         inputs_for("mine", "natural-rubber-2.3", tmp_path)
 
 
+def test_a_word_that_means_nothing_is_answered_with_what_there_is(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"nosuch: there is no such file.*double-bump.*saddle"):
+        inputs_for("nosuch", None, tmp_path)
+    with pytest.raises(UsageError, match="is a folder"):
+        inputs_for(str(tmp_path), None, tmp_path)
+
+
 def test_progress_of_a_build_never_goes_back_and_ends_at_all(tmp_path: Path) -> None:
     (tmp_path / "spec.yaml").write_text(SPEC)
     told: list[float] = []

@@ -189,6 +189,17 @@ def test_rings_that_an_exchange_closes_are_opened_again_where_that_pays() -> Non
     assert ratio <= 0.76  # 0.771 by exchanges that close no ring
 
 
+def test_once_enough_ends_were_turned_chains_stay_short_and_the_order_is_still_a_good_one() -> None:
+    ends = random_ends(3000, 1, length_mm=8.0)
+    greedy_mm = travel_mm(ends, greedy_with_flips(ends))
+    orders = {limit: tour(ends, turned_limit_count=limit) for limit in (0, 10**9)}
+    ratio = {limit: travel_mm(ends, order) / greedy_mm for limit, order in orders.items()}
+    assert ratio[10**9] < ratio[0] - 0.005
+    assert ratio[0] <= 0.8
+    assert (tour(ends, turned_limit_count=0) == orders[0]).all()
+    assert sorted(orders[0].tolist()) == list(range(len(ends)))
+
+
 def test_layers_come_in_order_and_the_inner_contour_before_the_outer() -> None:
     outer = CutPath("outline", SQUARE_mm, closed=True)
     inner = CutPath("outline", (SQUARE_mm / 4 + 20)[::-1], closed=True)
