@@ -83,11 +83,10 @@ def marks_command(
 ) -> None:
     """Engrave the marks of BOARD: on a scrap for the bed's alignment, or on a sheet for print and cut."""
     from design.export.gcode import GcodeOptions, gcode
-    from design.pattern.paths import LayerPreset
     from fabctl.config.bench import find, load_bench
     from fabctl.config.boards import load_board
     from fabctl.config.material import load_material
-    from fabctl.cut.compose import PITCH_SPOTS
+    from fabctl.cut.compose import PITCH_SPOTS, presets_of
     from fabctl.cut.job import CutOrder, laser_config_of
     from fabctl.vision.boards import hatch, sheet_ink
 
@@ -97,9 +96,7 @@ def marks_command(
     strokes = hatch(sheet_ink(sheet), PITCH_SPOTS * spot_mm, spot_mm)
 
     def compose(_: str, s_max_count: float) -> tuple[str, ...]:
-        layer = stuff.laser.engrave if stuff.laser is not None else None
-        preset = LayerPreset(layer.power_frac, layer.feed_mm_s) if layer is not None else LayerPreset(0.0, 1.0)
-        return gcode(strokes, {"engrave": preset}, GcodeOptions(s_max_count=s_max_count))
+        return gcode(strokes, presets_of(stuff), GcodeOptions(s_max_count=s_max_count))
 
     order = CutOrder(find("boards", board, home.root), compose, stuff, origin=origin, kind="marks")  # type: ignore[arg-type]  # click.Choice has checked it
     done = plain_job(order, bench_name, f"marks {sheet.name}", yes, dry_run)
@@ -111,7 +108,7 @@ def marks_command(
 
 
 def plain_job(order: CutOrder, bench_name: str, purpose: str, yes: bool, dry_run: bool = False) -> CutDone:
-    """Run a job that makes no specimen: the same checks, the same question, the same record."""
+    """Run a job that is no design: the same checks, the same question, the same record."""
     from fabctl.bench import open_bench
     from fabctl.config.bench import load_bench
     from fabctl.cut.job import Desk, cut

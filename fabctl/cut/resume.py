@@ -8,7 +8,7 @@ last. Asked before anything moves.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -45,7 +45,7 @@ from fabctl.cut.preflight import preflight
 from fabctl.cut.program import Program, read_program
 from fabctl.cut.progress import Place
 from fabctl.cut.recorded import has_begun, how_to_go_on, recorded
-from fabctl.cut.trail import burnt_before_mm, last_seen, read_trail, rest_of, stopped_at
+from fabctl.cut.trail import EXACT_MM, burnt_before_mm, last_seen, read_trail, rest_of, stopped_at
 from fabctl.cut.wirelog import WireLog
 from fabctl.errors import RefusedError, Stopped, UsageError
 from fabctl.events import Event
@@ -203,10 +203,23 @@ def _stopped(
     """Return where the machine stands on the program, None with its position lost; and where it was seen last."""
     times, log = program_times(program, identity), before.path / "wire.log"
     trail = read_trail(log.read_text(encoding="ascii", errors="replace"), program, times, offset_mm)
-    lost = (before.outcome() or {}).get("position_known") is False
+    lost = _lost(before.outcome() or {}, identity, report)
     elapsed_s = max(time.time() - log.stat().st_mtime, 0.0)
     stood = None if lost else stopped_at(trail, program, times, report, offset_mm, elapsed_s)
     return stood, last_seen(trail, program)
+
+
+def _lost(outcome: Mapping[str, Any], identity: Identity, report: Report) -> bool:
+    """Return whether the record says that the board's place means nothing any more.
+
+    A board without homing that was switched off counts from elsewhere: only one that is where it was left is believed.
+    """
+    if outcome.get("position_known") is False:
+        return True
+    left_mm, now_mm = outcome.get("machine_mm"), report.machine_mm
+    if identity.is_on(22) or left_mm is None or now_mm is None:
+        return False
+    return any(abs(a - b) > EXACT_MM for a, b in zip(left_mm[:2], now_mm[:2], strict=True))
 
 
 def _can_home(order: CutOrder, config: LaserConfig, identity: Identity) -> bool:

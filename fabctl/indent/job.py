@@ -32,7 +32,11 @@ from fabctl.records.ending import outcome_kept
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Specimen, Workspace
 
-CONDITIONS = ("thickness_mm", "batch", "rest_h")
+CONDITIONS = {
+    "thickness_mm": "the sheet's thickness",
+    "batch": "its batch",
+    "rest_h": "hours of rest since it was opened",
+}
 DRIFT_TOLD_FRAC = 0.01  # a drift of so much of the stiffness is told
 
 
@@ -216,7 +220,7 @@ def conditions(record: Mapping[str, Any], facts: Mapping[str, Any], now: datetim
 
 def unrecorded(known: Mapping[str, Any]) -> list[Finding]:
     """Say which conditions of a test nobody has written down: rubber depends on them."""
-    lacking = [name for name in CONDITIONS if name not in known]
+    lacking = [words for name, words in CONDITIONS.items() if name not in known]
     if not lacking:
         return []
     hint = "`fabctl specimen note S-… thickness_mm=2.31 batch=B7`, or --thickness-mm, --batch and --rest-h"

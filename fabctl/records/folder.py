@@ -205,7 +205,8 @@ def open_run(path: Path) -> RunFolder:
     """Return an existing run; raise `RecordError` where there is none or it is half written."""
     if not (path / "manifest.json").is_file():
         raise RecordError(f"{path}: no run here (manifest.json is missing)")
-    _read(path / "manifest.json")
+    if "started_utc" not in _read(path / "manifest.json"):
+        raise RecordError(f"{path}: no run here (its manifest.json is not that of a run)")
     return RunFolder(path)
 
 

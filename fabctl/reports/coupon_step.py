@@ -8,6 +8,7 @@ from typing import Any
 from fabctl.records.folder import RunFolder, status_of
 from fabctl.reports.indent_step import as_svg
 from fabctl.reports.model import Fact, Figure, Step, Word
+from fabctl.reports.numbers import with_half
 
 
 def coupon_step(run: RunFolder) -> Step:
@@ -23,9 +24,9 @@ def coupon_step(run: RunFolder) -> Step:
 
 
 def _fact(patch: Mapping[str, Any]) -> Fact:
-    value = f"{patch['expansion_ratio']:.4f} ± {patch['uncertainty_ratio']:.4f}"
+    value = with_half(patch["expansion_ratio"], patch["uncertainty_ratio"])
     expected, off = patch["expected_ratio"], patch["off_ratio"]
-    told = "the map: springs back" if expected is None else f"the map {expected:.4f}, off {off:+.4f}"
+    told = "the map: springs back" if expected is None else f"the map says {expected:.4f}: {off:+.4f} off"
     torn = patch["failed_at_count"]
     ended = (
         f"torn at cycle {torn} of {patch['cycles_count']}" if torn is not None else f"{patch['cycles_count']} cycles"
@@ -40,7 +41,7 @@ def coupon_verdict(run: RunFolder | None, cut: RunFolder | None) -> tuple[Word, 
         unread = ["coupon: its form is not read yet (fabctl design coupon-read)"] if run is None else []
         return "incomplete", "Not every step has a result.", missing + unread
     result = run.result() or {}
-    off = [patch for patch in result["patches"] if patch["agrees"] is False]
+    off = [patch for patch in result["patches"] if not patch["agrees"]]
     reasons = [
         f"patch {p['patch']}, hinge {p['hinge_mm']:.3f} mm: {p['off_ratio']:+.4f} off the map, more than its "
         f"uncertainty of {p['uncertainty_ratio']:.4f}"

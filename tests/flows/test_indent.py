@@ -92,7 +92,7 @@ def test_the_run_keeps_method_calibration_and_conditions(bench: SimulatedBench, 
     assert config["conditions"]["temperature_degC"] == pytest.approx(22.5)
     assert (config["conditions"]["batch"], config["conditions"]["rest_h"]) == ("B7", 24.0)
     (told,) = [f for f in config["findings"] if f["code"] == "INDENT-CONDITIONS"]
-    assert told["message"] == "not recorded: thickness_mm"
+    assert told["message"] == "not recorded: the sheet's thickness"
     assert config["rig"]["firmware"] == "1.04"
 
 
