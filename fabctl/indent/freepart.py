@@ -21,7 +21,7 @@ SLOW_RATIO, STRAIGHT_MM = 1.5, 0.8  # noise is slow beyond this ratio, seen over
 LEAST_N = 1e-6  # a noise of nothing would let every rounding count
 SPIKE_SIGMA = 12.0  # a sample so many noises off both its sides is a disturbance
 SIGNAL = 8.0  # the force must exceed the noise by this factor
-SURE_FRAC = 0.2  # of the way to the greatest force: there the specimen is met for sure
+SURE_FRAC, SURE_BANDS = 0.2, 2.0  # of the way to the greatest force, beyond the band: there it is met for sure
 BAND_SIGMA, BAND_FRAC = 4.5, 0.004  # a mean outside so many standard errors, and so much of the range, has risen
 DRIFT_N_MM = 2e-3  # how much the free part is expected to slope: drift over speed
 DRIFT_SIGMA = 2.0  # a slope is believed beyond so many of its standard errors
@@ -81,7 +81,7 @@ def _followed(f: Reals, noise_N: float, slow_ratio: float) -> tuple[int, float, 
     for _ in range(3):
         band = BAND_SIGMA * noise_N / np.sqrt(WIDTH) + BAND_FRAC * (top_N - level_N)
         risen = means - level_N > band
-        sure = means - level_N > max(band, SURE_FRAC * (float(means.max()) - level_N))
+        sure = means - level_N > max(SURE_BANDS * band, SURE_FRAC * (float(means.max()) - level_N))
         if not risen.any() or not sure.any():
             return "the force never rises steadily"
         free = np.flatnonzero(~risen[: int(np.argmax(sure))])  # what rises and comes back was no contact

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fabctl.indent.contact import find_contact
+from fabctl.indent.contact import find_contact, first_touch
 
 Reals = NDArray[np.float64]
 STARTS: dict[str, Callable[[Reals], Reals]] = {
@@ -186,3 +186,14 @@ def test_a_slow_wave_before_contact_is_noise_and_no_contact(seed: int) -> None:
     quiet = 0.6 * loaded - 0.09 * loaded**2 + 0.006 * loaded**3 + rng.normal(0, 0.002, len(u))
     found = find_contact(u, quiet + 0.01 * np.sin(0.018 * np.pi * np.arange(len(u)) + rng.uniform(0, 6)))
     assert found.position_mm == pytest.approx(1.5, abs=0.06)
+
+
+@pytest.mark.parametrize("stiffness_N_mm", [0.43, 0.7])
+def test_a_dip_of_the_noise_during_an_approach_makes_no_early_touch(stiffness_N_mm: float) -> None:
+    """In this draw the touch was 1.9 mm early, and the loading would have ended as much too high."""
+    rng = np.random.default_rng(47)
+    contact_mm = rng.uniform(1.8, 2.4)
+    u = np.arange(0.2, contact_mm + 0.06 / stiffness_N_mm + 0.05, 0.03)
+    force = stiffness_N_mm * np.maximum(u - contact_mm, 0.0) + rng.normal(0, 0.01, len(u))
+    touched = first_touch(u, force)
+    assert touched is None or touched > contact_mm - 0.6
