@@ -12,6 +12,7 @@ import click
 
 from fabctl.cli.common import bench_option, json_option, lab, progress, say, seed_option, show
 from fabctl.cli.paths import RUN, SPECIMEN_OR_FILE, InFile, InFolder, config_names
+from fabctl.cli.refusal import finding_of
 from fabctl.errors import REFUSED, FabctlError, RefusedError, Stopped, UsageError
 
 if TYPE_CHECKING:
@@ -369,5 +370,5 @@ def _lines(body: dict[str, Any], page: Path) -> list[str]:
             f"against the predicted shape: rms {model['rms_mm']:.3f} mm; "
             f"it knew {model['known_frac']:.0%} of the deviation"
         )
-    lines += [f"{f['level']} {f['code']}: {f['message']}" for f in body["findings"]]
+    lines += [str(finding_of(row)) for row in body["findings"]]
     return [*lines, f"report: {page}"]
