@@ -208,8 +208,17 @@ def _capture(url: str) -> Any:
             capture = cv2.VideoCapture(url, cv2.CAP_FFMPEG, limits)
     if not capture.isOpened():
         capture.release()
-        raise TransportError(url, "the camera does not open", "plugged in, allowed (group video), not in use?")
+        raise TransportError(url, "the camera does not open", _why_closed(url))
     return capture
+
+
+def _why_closed(url: str) -> str:
+    """Return what to look at where a camera does not open."""
+    if url.startswith(STREAMS):
+        return f"is it on, and this its address? it has {2 * TIMEOUT_s:g} s to answer"
+    if url.isdigit() or url.startswith("/dev/"):
+        return "plugged in, allowed (group video), not in use?"
+    return f"neither a film nor a picture: {READABLE}"
 
 
 def _frame(image: NDArray[Any], source: str) -> Frame:

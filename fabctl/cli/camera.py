@@ -80,10 +80,7 @@ def calibrate(pictures: tuple[Path, ...], board_name: str, views: int, bench_nam
     for _, found in seen:
         for finding in found:
             say(str(finding))
-    sizes = {frame.image.shape for frame in frames}
-    if len(sizes) != 1:
-        raise UsageError(f"the pictures have {len(sizes)} sizes; a lens is measured at one")
-    h, w = sizes.pop()
+    h, w = _one_size(frames)
     good = [view for view, _ in seen if view is not None]
     path = lens_path(state, bench.camera.calibration if bench.camera else None)
     drawn = path.with_suffix(".png")
@@ -262,6 +259,21 @@ def bed_picture(bench_name: str, image: Path | None) -> Frame:
     from fabctl.files import picture_of
 
     return picture_of(image) if image is not None else snapshot(_camera_url(*bench_and_state(bench_name)))
+
+
+def _one_size(frames: list[Frame]) -> tuple[int, int]:
+    """Return height and width of all the pictures; raise `UsageError` naming those of another size than the most."""
+    from collections import Counter
+
+    from fabctl.errors import UsageError
+
+    (h, w), count = Counter(frame.image.shape for frame in frames).most_common(1)[0]
+    others = [f"{f.source} has {f.image.shape[1]} x {f.image.shape[0]}" for f in frames if f.image.shape != (h, w)]
+    if others:
+        many = f" and {len(others) - 3} more" if len(others) > 3 else ""
+        text = f"{count} pictures have {w} x {h} px, but {', '.join(others[:3])}{many}"
+        raise UsageError(f"{text}; a lens is measured at one size: leave the others out")
+    return h, w
 
 
 def _readable(pictures: Iterable[Path]) -> list[Frame]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING
 
 import click
@@ -29,13 +30,28 @@ def size(text: str) -> tuple[float, float]:
     return w, h
 
 
+def squares(text: str) -> tuple[int, int]:
+    """Return columns and rows of `10x7`."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
+        raise click.BadParameter(f"{text!r} is not columns x rows in whole numbers, such as 10x7")
+    return int(parts[0]), int(parts[1])
+
+
+def board_name(text: str) -> str:
+    """Return a name that a board and its files can have."""
+    if not re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,63}", text):
+        raise click.BadParameter(f"{text!r} is not a name of small letters, digits, - and _, such as lens-2")
+    return text
+
+
 @click.group("board")
 def board() -> None:
     """Make boards to print or engrave, and note what the print measures."""
 
 
 @board.command("charuco")
-@click.option("--squares", type=size, metavar="WxH", default="10x7", show_default=True, help="Columns and rows.")
+@click.option("--squares", type=squares, metavar="WxH", default="10x7", show_default=True, help="Columns and rows.")
 @click.option("--square-mm", type=click.FloatRange(1, 1000), default=20.0, show_default=True, help="Side of a square.")
 @click.option(
     "--marker-mm",
@@ -44,16 +60,17 @@ def board() -> None:
     show_default=True,
     help="Side of the marker in a square.",
 )
-@click.option("--name", default="lens", show_default=True, help="The board's name.")
+@click.option("--name", type=board_name, default="lens", show_default=True, help="The board's name.")
 @json_option
-def charuco(squares: tuple[float, float], square_mm: float, marker_mm: float, name: str, as_json: bool) -> None:
+def charuco(squares: tuple[int, int], square_mm: float, marker_mm: float, name: str, as_json: bool) -> None:
     """Make a ChArUco board for the lens."""
     from fabctl.vision.boards import CHARUCO_IDS, Charuco
 
-    columns, rows = int(squares[0]), int(squares[1])
+    columns, rows = squares
     if not 0 < marker_mm < square_mm or min(columns, rows) < 3 or columns * rows // 2 > len(CHARUCO_IDS):
         limit = 2 * len(CHARUCO_IDS)
-        raise click.UsageError(f"markers must be smaller than squares, and squares 3x3 at least and {limit} at most")
+        text = f"a board has 3x3 squares at least, {limit} in all at most, and markers smaller than a square"
+        raise click.UsageError(f"{text}; not {columns}x{rows} of {square_mm:g} mm with markers of {marker_mm:g} mm")
     _write_board(Charuco(name, columns, rows, square_mm, marker_mm), as_json)
 
 
@@ -63,7 +80,7 @@ def charuco(squares: tuple[float, float], square_mm: float, marker_mm: float, na
     "--size-mm", type=size, metavar="WxH", required=True, help="The bed's travel, or the sheet's width and height."
 )
 @click.option("--side-mm", type=click.FloatRange(0.5, 1000), default=None, help="Side of a mark's black square.")
-@click.option("--name", default=None, help="The board's name; its kind where none is given.")
+@click.option("--name", type=board_name, default=None, help="The board's name; its kind where none is given.")
 @json_option
 def marks(kind: str, size_mm: tuple[float, float], side_mm: float | None, name: str | None, as_json: bool) -> None:
     """Make a sheet of marks: for the bed's alignment, in a sheet's corners, or around a specimen."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
+from fabctl.cli.common import MATERIAL, F, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
 from fabctl.cli.paths import config_names
 
 if TYPE_CHECKING:
@@ -59,32 +59,34 @@ def _is_registration(path: Path) -> bool:
     return isinstance(data, dict) and "sheet" in data
 
 
+def plain_job_options(command: F) -> F:
+    """Give a command what every job that makes no specimen takes."""
+    origin = click.option(
+        "--origin",
+        type=click.Choice(["home", "here"]),
+        default="home",
+        show_default=True,
+        help="Where the job's corner lies: in the corner of the travel, or where the head is.",
+    )
+    dry_run = click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
+    return origin(dry_run(bench_option(yes_option(json_option(command)))))
+
+
 @click.command("marks")
 @click.argument("board", type=config_names("boards"))
 @click.option(
     "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives power and speed."
 )
-@click.option(
-    "--origin",
-    type=click.Choice(["home", "here"]),
-    default="home",
-    show_default=True,
-    help="Where the board's corner lies: in the corner of the travel, or where the head is.",
-)
-@click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
-@bench_option
-@yes_option
-@json_option
+@plain_job_options
 def marks_command(
     board: str, material: str, origin: str, dry_run: bool, bench_name: str, yes: bool, as_json: bool
 ) -> None:
     """Engrave the marks of BOARD: on a scrap for the bed's alignment, or on a sheet for print and cut."""
     from design.export.gcode import GcodeOptions, gcode
-    from design.pattern.paths import LayerPreset
     from fabctl.config.bench import find, load_bench
     from fabctl.config.boards import load_board
     from fabctl.config.material import load_material
-    from fabctl.cut.compose import PITCH_SPOTS
+    from fabctl.cut.compose import PITCH_SPOTS, presets_of
     from fabctl.cut.job import CutOrder, laser_config_of
     from fabctl.vision.boards import hatch, sheet_ink
 
@@ -94,9 +96,7 @@ def marks_command(
     strokes = hatch(sheet_ink(sheet), PITCH_SPOTS * spot_mm, spot_mm)
 
     def compose(_: str, s_max_count: float) -> tuple[str, ...]:
-        layer = stuff.laser.engrave if stuff.laser is not None else None
-        preset = LayerPreset(layer.power_frac, layer.feed_mm_s) if layer is not None else LayerPreset(0.0, 1.0)
-        return gcode(strokes, {"engrave": preset}, GcodeOptions(s_max_count=s_max_count))
+        return gcode(strokes, presets_of(stuff), GcodeOptions(s_max_count=s_max_count))
 
     order = CutOrder(find("boards", board, home.root), compose, stuff, origin=origin, kind="marks")  # type: ignore[arg-type]  # click.Choice has checked it
     done = plain_job(order, bench_name, f"marks {sheet.name}", yes, dry_run)
@@ -108,7 +108,7 @@ def marks_command(
 
 
 def plain_job(order: CutOrder, bench_name: str, purpose: str, yes: bool, dry_run: bool = False) -> CutDone:
-    """Run a job that makes no specimen: the same checks, the same question, the same record."""
+    """Run a job that is no design: the same checks, the same question, the same record."""
     from fabctl.bench import open_bench
     from fabctl.config.bench import load_bench
     from fabctl.cut.job import Desk, cut

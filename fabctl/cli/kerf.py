@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, bench_option, json_option, lab, show, yes_option
+from fabctl.cli.common import MATERIAL, bench_option, json_option, lab, say, show
+from fabctl.cli.cut_camera import plain_job, plain_job_options
 from fabctl.cli.finite import numbers
 from fabctl.cli.paths import InFile, InFolder, OutFolder
 
 if TYPE_CHECKING:
+    from drivers.camera import Frame
     from fabctl.vision.coupon import Coupon
     from fabctl.vision.kerf import KerfMeasurement
 
@@ -72,47 +74,38 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
 
 @command.command("cut")
 @click.argument("folder", type=InFolder())
-@click.option(
-    "--origin",
-    type=click.Choice(["home", "here"]),
-    default="home",
-    show_default=True,
-    help="Where the coupon's corner lies: in the corner of the travel, or where the head is.",
-)
-@click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
-@bench_option
-@yes_option
-@json_option
+@plain_job_options
 def cut_coupon(folder: Path, origin: str, dry_run: bool, bench_name: str, yes: bool, as_json: bool) -> None:
     """Cut the coupon in FOLDER: the same checks, the same question and the same record as any cut."""
     from design.export.gcode import GcodeOptions
-    from design.pattern.paths import LayerPreset
-    from fabctl.cli.cut_camera import plain_job
+    from design.pattern.font import text_strokes
     from fabctl.config.bench import load_bench
     from fabctl.config.material import load_material
+    from fabctl.cut.compose import code_strokes, presets_of
     from fabctl.cut.job import CutOrder, laser_config_of
-    from fabctl.vision.coupon import coupon_gcode
+    from fabctl.vision.coupon import coupon_gcode, id_places
 
     file = folder / "coupon.json"
     made, material = read_coupon(file)
     stuff = load_material(material, lab().root)
     spot_mm = laser_config_of(load_bench(bench_name, lab().root)).spot_mm
-    layer = stuff.laser.engrave if stuff.laser is not None else None
-    engrave = LayerPreset(layer.power_frac, layer.feed_mm_s, layer.passes_count) if layer else LayerPreset(0.0, 1.0)
+    anchor, box = id_places(made)
 
-    def compose(_: str, s_max_count: float) -> tuple[str, ...]:
-        return coupon_gcode(made, engrave, spot_mm, GcodeOptions(s_max_count=s_max_count))
+    def compose(specimen: str, s_max_count: float) -> tuple[str, ...]:
+        strokes = [*text_strokes(specimen, anchor), *code_strokes(specimen, box, spot_mm)]
+        return coupon_gcode(made, presets_of(stuff)["engrave"], spot_mm, GcodeOptions(s_max_count=s_max_count), strokes)
 
-    order = CutOrder(file, compose, stuff, origin=origin, kind="coupon")  # type: ignore[arg-type]  # click.Choice has checked it
+    order = CutOrder(file, compose, stuff, origin=origin, kind="kerf-coupon")  # type: ignore[arg-type]  # click.Choice has checked it
     done = plain_job(order, bench_name, f"coupon {folder.name}", yes, dry_run)
-    facts = {"coupon": str(file), "run": done.run.run_id if done.run else None, **done.result}
-    if done.run is None:
+    facts = {"coupon": str(file), "specimen": None, "run": None, **done.result}
+    if done.run is None or done.specimen is None:
         show(facts, as_json, [f"checked: {facts['lines_count']} lines"])
         return
+    facts |= {"specimen": done.specimen.name, "run": done.run.run_id}
     done.run.artefact("coupon.json").write_bytes(file.read_bytes())
     advice = "let the squares fall out, photograph it over a light table at 0.05 mm a pixel or finer, then:"
-    command_line = f"fabctl kerf measure PICTURE --coupon {file} --write"
-    show(facts, as_json, [f"the coupon is cut; run {done.run.run_id}", advice, command_line])
+    told = f"the coupon {done.specimen.name} is cut; run {done.run.run_id}"
+    show(facts, as_json, [told, advice, "fabctl kerf measure PICTURE --write"])
 
 
 def read_coupon(path: Path) -> tuple[Coupon, str]:
@@ -128,10 +121,36 @@ def read_coupon(path: Path) -> tuple[Coupon, str]:
         raise UsageError(f"{path}: not a coupon: {why_not(fault)}; `fabctl kerf coupon` makes one") from fault
 
 
+def _coupon_in(frame: Frame, file: Path | None) -> tuple[str | None, Coupon, str]:
+    """Return the id of the coupon in the picture, the coupon and its material.
+
+    Raises `RefusedError` where `file` says otherwise than the coupon was cut, `UsageError` where nothing tells it.
+    """
+    from design.findings import Finding
+    from fabctl.errors import RefusedError, UsageError
+    from fabctl.vision.ids import read_ids
+
+    told = read_coupon(file) if file is not None else None
+    for name in [engraved.specimen for engraved in read_ids(frame.image)]:
+        own = lab().specimens / name / "design" / "coupon.json"
+        if not own.is_file():
+            say(f"the id {name} is engraved there, of no coupon that was cut here")
+            continue
+        cut = read_coupon(own)
+        if told not in (None, cut):
+            text = f"the picture shows {name}, which was not cut as {file} says"
+            found = Finding("KERF-COUPON", text, where=frame.source, hint="without --coupon its own is taken")
+            raise RefusedError("the kerf would be told of other powers", [found])
+        return name, *cut
+    if told is None:
+        raise UsageError(f"{frame.source}: no id of a coupon that was cut here is seen; give --coupon coupon.json")
+    return None, *told
+
+
 @command.command("measure")
 @click.argument("image", type=InFile())
 @click.option(
-    "--coupon", "coupon_file", type=InFile(), required=True, help="The coupon.json of the coupon in the picture."
+    "--coupon", "coupon_file", type=InFile(), help="The coupon.json of the coupon in the picture  [its id's own]."
 )
 @click.option("--write", is_flag=True, help="Write the kerf into the lab's material file.")
 @click.option(
@@ -142,17 +161,18 @@ def read_coupon(path: Path) -> tuple[Coupon, str]:
     help="How the picture's grey follows light.",
 )
 @json_option
-def measure(image: Path, coupon_file: Path, write: bool, gamma: str, as_json: bool) -> None:
+def measure(image: Path, coupon_file: Path | None, write: bool, gamma: str, as_json: bool) -> None:
     """Measure the kerf per power and direction in a picture of the coupon, with its uncertainty."""
     from fabctl.config.material import load_material
     from fabctl.errors import UsageError
     from fabctl.files import picture_of
     from fabctl.vision import kerf as kerfs
 
-    made, material = read_coupon(coupon_file)
     frame = picture_of(image)
+    specimen, made, material = _coupon_in(frame, coupon_file)
     found = kerfs.measure(frame.image, frame.source, made, gamma)
     data, lines = _table(found)
+    data["specimen"] = specimen
     if write:
         stuff = load_material(material, lab().root)
         if stuff.laser is None:

@@ -330,6 +330,7 @@ def _compared(
 
     try:
         made = compare(request, emit)
+        emit(Event("stage", "drawing the pictures and writing the report"))
         body = record(run, made)
     except KeyboardInterrupt:
         run.finish("stopped", "stopped by the operator")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from fabctl.config.loader import Model, load
 from fabctl.errors import ConfigError
@@ -49,10 +49,15 @@ class ScanConfig(Model):
         return self
 
 
+def _number_as_text(value: object) -> object:
+    """Return a device number, which YAML takes for a number, as text."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
 class CameraConfig(Model):
     """The bed camera: a device number or path, a URL, or a folder of pictures."""
 
-    url: str
+    url: Annotated[str, BeforeValidator(_number_as_text), Field(min_length=1)]
     calibration: str | None = None
 
 

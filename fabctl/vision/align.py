@@ -21,7 +21,7 @@ from fabctl.files import json_of, why_not
 from fabctl.records.folder import as_json, write_atomically
 from fabctl.vision.boards import MarkSheet
 from fabctl.vision.lens import Lens, lens_from
-from fabctl.vision.markers import Marker, find_all, mirrored
+from fabctl.vision.markers import FAMILIES, Marker, find_all, mirrored
 from fabctl.vision.quality import picture_findings
 from fabctl.vision.template import F64
 
@@ -32,6 +32,7 @@ MOST_SIDE_RATIO = 0.04  # by how much a mark may look larger or smaller than tol
 MOST_RMS_MM = 0.1
 MOST_WORST_MM = 0.3
 MOST_AGE_DAYS = 30.0
+CLOCK_DAYS = 1.0  # by which two computers' clocks may differ
 MOST_DRIFT_MM = 0.15
 
 
@@ -122,7 +123,8 @@ def mark_findings(markers: list[Marker], image: NDArray[np.uint8], sheet: MarkSh
             hint = "turn the sheet over; if the picture itself is mirrored (by a mirror, from below), set the camera so"
             return [Finding("MARKS-MIRRORED", text, where=sheet.name, hint=f"{hint} that it is not")]
         text = f"{len(markers)} of {len(sheet.marks)} marks of {sheet.name} found, at least {least} are needed"
-        return [Finding("MARKS-FEW", text, where=sheet.name, hint="covered, blurred, glare, or another sheet?")]
+        hint = f"covered, blurred, glare, or another sheet?{_strangers(image, sheet)}"
+        return [Finding("MARKS-FEW", text, where=sheet.name, hint=hint)]
     places = np.array([(m.x_mm, m.y_mm) for m in (sheet.mark(k.id) for k in markers) if m is not None])
     whole = np.array([(m.x_mm, m.y_mm) for m in sheet.marks])
     share = hull_area(places) / max(hull_area(whole), 1e-9)
@@ -130,6 +132,17 @@ def mark_findings(markers: list[Marker], image: NDArray[np.uint8], sheet: MarkSh
         text = f"the {len(markers)} marks found span {share:.0%} of the sheet, {LEAST_SPAN_RATIO:.0%} is the least"
         return [Finding("MARKS-SPAN", text, where=sheet.name, hint="uncover marks at the other side")]
     return []
+
+
+def _strangers(image: NDArray[np.uint8], sheet: MarkSheet) -> str:
+    """Return which markers are in the picture that are not the sheet's, of any family; nothing where there are none."""
+    own = {mark.id for mark in sheet.marks}
+    seen = {
+        family: [m.id for m in find_all(image, family) if family != sheet.family or m.id not in own]
+        for family in FAMILIES
+    }
+    told = [f"{', '.join(map(str, ids[:8]))}{'…' * (len(ids) > 8)} of {family}" for family, ids in seen.items() if ids]
+    return f" other markers are there: {'; '.join(told)}" if told else ""
 
 
 def hull_area(points: F64) -> float:
@@ -221,6 +234,11 @@ def drift_findings(image: NDArray[np.uint8], source: str, alignment: Alignment, 
     if age_days > MOST_AGE_DAYS:
         text = f"the alignment is {age_days:.0f} days old, {MOST_AGE_DAYS:.0f} is the limit"
         found.append(Finding("ALIGN-OLD", text, where=source, hint="`fabctl camera align` again"))
+    if age_days < -CLOCK_DAYS:
+        text = f"the alignment is of {alignment.made_utc[:10]}, which is yet to come, so its age is not known"
+        found.append(
+            Finding("ALIGN-OLD", text, where=source, hint="is the clock right? then `fabctl camera align` again")
+        )
     moved = witness_drift_mm(image, alignment)
     if not moved:
         text = f"none of the {len(alignment.witnesses)} marks of the alignment is in the picture"
@@ -282,17 +300,14 @@ def read_alignment(path: Path) -> Alignment:
             raise UsageError(f"{path}: alignment format {data['format']}, this tool reads {FORMAT}; align again")
         height_mm, rms_mm, worst_mm = (float(data[key]) for key in ("height_mm", "rms_mm", "worst_mm"))
         witnesses = tuple(Witness(**row) for row in data["witnesses"])
+        R, t_mm = np.array(data["R"], dtype=np.float64), np.array(data["t_mm"], dtype=np.float64)
+        places = [value for w in witnesses for value in (w.x_mm, w.y_mm, w.u_px, w.v_px)]
+        if R.shape != (3, 3) or t_mm.shape != (3,) or not np.isfinite([*R.flat, *t_mm, height_mm, *places]).all():
+            raise ValueError("R must be 3 x 3, t_mm 3, and all of them and the witnesses finite numbers")
+        made_utc = str(data["made_utc"])
+        if datetime.fromisoformat(made_utc).tzinfo is None:
+            raise ValueError("made_utc says no time zone")
         lens = lens_from(data["lens"], str(path))
-        return Alignment(
-            lens,
-            np.array(data["R"], dtype=np.float64),
-            np.array(data["t_mm"], dtype=np.float64),
-            height_mm,
-            rms_mm,
-            worst_mm,
-            witnesses,
-            str(data["made_utc"]),
-            str(data["marks"]),
-        )
+        return Alignment(lens, R, t_mm, height_mm, rms_mm, worst_mm, witnesses, made_utc, str(data["marks"]))
     except (KeyError, TypeError, ValueError) as fault:
         raise UsageError(f"{path}: not an alignment: {why_not(fault)}; run `fabctl camera align`") from fault

@@ -2,6 +2,7 @@
 
 The squares fall out, so a picture shows how bright "open" is everywhere on it; and each is larger than drawn by one
 kerf, a second measurement of it. Marks are engraved by the same machine, so the coupon's millimetres are the machine's.
+Between the upper marks stands its id, so that a picture tells which coupon it shows.
 """
 
 from __future__ import annotations
@@ -12,13 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from design.export.gcode import END, GcodeOptions, gcode
+from design.pattern.drawing import Box
+from design.pattern.font import Anchor
 from design.pattern.paths import CutPath, LayerPreset
 from fabctl.errors import UsageError
 from fabctl.files import why_not
 from fabctl.vision.boards import COUPON_IDS, Mark, MarkSheet, hatch, sheet_ink
+from fabctl.vision.ids import id_size_modules
 from fabctl.vision.template import F64
 
-FORMAT = 1
+FORMAT = 2  # 1 had no room for an id
 SLIT_MM = 8.0
 PITCH_MM = 2.5
 SLITS_COUNT = 4
@@ -27,6 +31,9 @@ MARK_MM = 6.0
 MARGIN_MM = 3.0
 ROW_MM = 11.0
 GAP_MM = 3.0
+MODULE_MM = 0.75  # of the id's code
+TEXT_MM = 3.0
+MOST_FEED_MM_S, MOST_PASSES_COUNT = 10_000.0, 100
 HEADER_LINES = 5  # G21 G90 G94 G17 M4S0: modal words, once
 
 
@@ -86,7 +93,7 @@ def make_coupon(powers_frac: Sequence[float], feed_mm_s: float, passes_count: in
         for x in (first, left + SLIT_MM + GAP_MM, last):
             windows.append(Window(power, (x + WINDOW_MM / 2, middle), WINDOW_MM))
     width = last + WINDOW_MM + GAP_MM + MARK_MM + MARGIN_MM
-    height = max(2 * MARGIN_MM + len(powers_frac) * ROW_MM, 2 * MARK_MM + 3 * MARGIN_MM)
+    height = 2 * MARGIN_MM + len(powers_frac) * ROW_MM + MARK_MM
     near, far_x, far_y = MARGIN_MM + MARK_MM / 2, width - MARGIN_MM - MARK_MM / 2, height - MARGIN_MM - MARK_MM / 2
     places = [(near, near), (far_x, near), (far_x, far_y), (near, far_y)]
     marks = tuple(Mark(COUPON_IDS[k], x, y, MARK_MM) for k, (x, y) in enumerate(places))
@@ -115,9 +122,21 @@ def strokes_at(coupon: Coupon, power_frac: float) -> list[CutPath]:
     return (slits + squares) * coupon.passes_count
 
 
-def coupon_gcode(coupon: Coupon, engrave: LayerPreset, spot_mm: float, options: GcodeOptions) -> tuple[str, ...]:
-    """Return the program: marks, then the ladders in the order of their power."""
-    first = gcode(mark_strokes(coupon, spot_mm), {"engrave": engrave}, options)
+def id_places(coupon: Coupon) -> tuple[Anchor, Box]:
+    """Return where the id's text and its code are engraved: between the upper marks, a margin from them."""
+    across, up = id_size_modules()
+    width_mm, height_mm = across * MODULE_MM, up * MODULE_MM
+    left, low = MARGIN_MM + MARK_MM + GAP_MM, coupon.size_mm[1] - MARGIN_MM - height_mm
+    start, end = left + width_mm + GAP_MM, coupon.size_mm[0] - left
+    text = Anchor((start + end) / 2, low + height_mm / 2, TEXT_MM, end - start)
+    return text, Box(left, low, width_mm, height_mm)
+
+
+def coupon_gcode(
+    coupon: Coupon, engrave: LayerPreset, spot_mm: float, options: GcodeOptions, id_strokes: Sequence[CutPath] = ()
+) -> tuple[str, ...]:
+    """Return the program: marks and id, then the ladders in the order of their power."""
+    first = gcode([*mark_strokes(coupon, spot_mm), *id_strokes], {"engrave": engrave}, options)
     lines = list(first[: -len(END)])
     for power in powers_of(coupon):
         preset = LayerPreset(power, coupon.feed_mm_s)
@@ -150,10 +169,14 @@ def coupon_from(data: dict[str, object], where: str) -> Coupon:
     """Return the coupon of `coupon_data`; raise `UsageError` where it is none."""
     try:
         if data["format"] != FORMAT:
-            raise UsageError(f"{where}: coupon format {data['format']}, this tool reads {FORMAT}")
+            text = f"coupon format {data['format']}, this tool reads {FORMAT}; make and cut the coupon again"
+            raise UsageError(f"{where}: {text}")
         powers, feed, passes = data["powers_frac"], data["feed_mm_s"], data["passes_count"]
         if not isinstance(powers, list) or not isinstance(feed, int | float) or not isinstance(passes, int):
             raise ValueError("powers_frac must be a list, feed_mm_s a number, passes_count a whole number")
+        if not (0 < feed < MOST_FEED_MM_S and 0 < passes <= MOST_PASSES_COUNT):
+            limits = f"feed_mm_s up to {MOST_FEED_MM_S:g}, passes_count up to {MOST_PASSES_COUNT}"
+            raise ValueError(f"{limits}, both above zero, not {feed:g} and {passes}")
         return make_coupon([float(p) for p in powers], float(feed), passes)
     except (KeyError, TypeError, ValueError) as fault:
         raise UsageError(f"{where}: not a coupon: {why_not(fault)}") from fault

@@ -100,7 +100,7 @@ def inspection_findings(inspection: Inspection) -> list[Finding]:
     shift = math.hypot(*inspection.shift_mm)
     if shift > MOST_DISPLACED_MM:
         text = f"the whole job lies {shift:.2f} mm off ({inspection.shift_mm[0]:+.2f}, {inspection.shift_mm[1]:+.2f})"
-        found.append(Finding("CUT-SHIFTED", text, "warning", hint="origin, alignment or registration"))
+        found.append(Finding("CUT-SHIFTED", text, hint="origin, alignment, or the sheet has moved (--registration)"))
     return found
 
 

@@ -41,7 +41,8 @@ SCALE_RATIO = 0.003
 LEAST_KERF_MM = 0.03  # below this the slit is not through
 MOST_DISAGREE_MM = 0.04
 MOST_RIM_RATIO = 0.2
-MOST_MISPLACED_MM = 0.3  # of a mark's centre; half a percent of the coupon
+MOST_MISPLACED_MM = 0.3  # of a mark's centre or side; half a percent of the coupon
+OTHER_COUPON = "the coupon.json of this coupon? lying flat?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,12 +155,26 @@ def _coupon_to_pixels(markers: Sequence[Marker], sheet: MarkSheet) -> F64:
 def _layout_findings(H: F64, markers: Sequence[Marker], sheet: MarkSheet, source: str) -> list[Finding]:
     """Return an error where the marks do not lie as the coupon's: it is another one, or the picture is bent."""
     pairs = [(marker, mark) for marker in markers if (mark := sheet.mark(marker.id)) is not None]
-    seen = warp(np.asarray(np.linalg.inv(H), dtype=np.float64), np.array([marker.centre_px for marker, _ in pairs]))
+    back = np.asarray(np.linalg.inv(H), dtype=np.float64)
+    seen = warp(back, np.array([marker.centre_px for marker, _ in pairs]))
     off_mm = float(np.linalg.norm(seen - np.array([mark.centre_mm for _, mark in pairs]), axis=1).max())
-    if off_mm <= MOST_MISPLACED_MM:
-        return []
-    text = f"a mark lies {off_mm:.2f} mm from where this coupon has it, {MOST_MISPLACED_MM:g} mm is the limit"
-    return [Finding("KERF-COUPON", text, where=source, hint="the coupon.json of this coupon? lying flat?")]
+    if off_mm > MOST_MISPLACED_MM:
+        text = f"a mark lies {off_mm:.2f} mm from where this coupon has it, {MOST_MISPLACED_MM:g} mm is the limit"
+        return [Finding("KERF-COUPON", text, where=source, hint=OTHER_COUPON)]
+    # Four marks of a coupon with more rows or fewer are stretched into place without a rest; their sides tell it.
+    corners = np.array([warp(back, marker.corners_px) for marker, _ in pairs])
+    told = np.array([mark.side_mm for _, mark in pairs])
+    off_mm = max(float(np.median(np.abs(_side_mm(corners, k) - told))) for k in (0, 1))
+    if off_mm > MOST_MISPLACED_MM:
+        text = f"the marks' sides are {off_mm:.2f} mm off, {MOST_MISPLACED_MM:g} mm is the limit"
+        return [Finding("KERF-COUPON", text, where=source, hint=OTHER_COUPON)]
+    return []
+
+
+def _side_mm(corners: F64, first: int) -> F64:
+    """Return the mean length of two opposite sides of squares (n, 4, 2), the first from corner `first`."""
+    a, b, c, d = (corners[:, (first + k) % 4] for k in range(4))
+    return np.asarray((np.linalg.norm(b - a, axis=1) + np.linalg.norm(d - c, axis=1)) / 2, dtype=np.float64)
 
 
 def _mm_per_px(H: F64, coupon: Coupon) -> float:

@@ -259,8 +259,8 @@ def lens_from(data: dict[str, Any], where: str) -> Lens:
         if data["format"] != FORMAT:
             raise UsageError(f"{where}: lens format {data['format']}, this tool reads {FORMAT}; calibrate again")
         K, distortion = np.array(data["K"], dtype=np.float64), np.array(data["distortion"], dtype=np.float64)
-        if K.shape != (3, 3) or distortion.shape != (5,) or not np.isfinite(K).all():
-            raise ValueError("K must be 3 x 3, distortion 5 numbers")
+        if K.shape != (3, 3) or distortion.shape != (5,) or not np.isfinite([*K.flat, *distortion]).all():
+            raise ValueError("K must be 3 x 3, distortion 5 finite numbers")
         w, h = data["size_px"]
         rms_px, repeat_px, coverage = (float(data[key]) for key in ("rms_px", "repeat_px", "coverage_ratio"))
         made, board = str(data["made_utc"]), str(data["board"])

@@ -27,6 +27,8 @@ COLOURS: dict[str, Colour] = {
     "slit": (30, 30, 230),
     "outline": (40, 180, 40),
 }
+PROGRAM_COLOURS = {"the sheet": "outline", "cut": "slit", "engraved": "engrave"}
+GRID, ERROR = (120, 180, 60), (30, 30, 230)
 SHIFT = 4  # OpenCV draws in sixteenths of a pixel
 MAGNIFIED = 100  # error arrows are drawn this much longer
 
@@ -59,7 +61,7 @@ def job_on_bed(
     for path in paths:
         points = apply(affine, dense(path.points_mm, path.closed))
         polyline(picture, alignment.to_pixels(points, height_mm), COLOURS[path.layer])
-    return picture
+    return _explained(picture, [(layer, COLOURS[layer]) for layer in COLOURS if layer in {p.layer for p in paths}])
 
 
 def program_on_bed(
@@ -81,7 +83,7 @@ def program_on_bed(
     pixels = alignment.to_pixels(ends, sheet.height_mm).reshape(-1, 2, 2) if len(ends) else np.empty((0, 2, 2))
     for line, (_, _, power) in zip(pixels, moves_mm, strict=True):
         polyline(picture, line, COLOURS["slit" if power >= strongest / 2 else "engrave"])
-    return picture
+    return _explained(picture, [(name, COLOURS[layer]) for name, layer in PROGRAM_COLOURS.items()])
 
 
 STATES: dict[str, Colour] = {
@@ -105,6 +107,11 @@ def inspection_on_bed(image: Picture, paths: Sequence[CutPath], found: Inspectio
     counts = {state: sum(seen.state == state for seen in found.paths) for state in STATES}
     rows = [(f"{state.replace('_', ' ')}: {counts[state]}", colour) for state, colour in STATES.items()]
     return np.asarray(np.vstack([_legend(picture.shape[1], rows), picture]), dtype=np.uint8)
+
+
+def _explained(picture: Picture, rows: Sequence[tuple[str, Colour]]) -> Picture:
+    """Return the picture with what its colours mean under it."""
+    return np.asarray(np.vstack([picture, _legend(picture.shape[1], rows)]), dtype=np.uint8) if rows else picture
 
 
 def _legend(width_px: int, rows: Sequence[tuple[str, Colour]]) -> Picture:
@@ -154,17 +161,26 @@ def error_map(image: Picture, alignment: Alignment) -> Picture:
     for k in (0, 1):
         for value in np.arange(low[k], high[k] + 1, 20):
             ends = np.array([[value, low[1]], [value, high[1]]] if k == 0 else [[low[0], value], [high[0], value]])
-            polyline(picture, alignment.to_pixels(dense(ends, False)), (120, 180, 60))
+            polyline(picture, alignment.to_pixels(dense(ends, False)), GRID)
     told = alignment.to_pixels(places)
     for witness, at in zip(alignment.witnesses, told, strict=True):
         seen = np.array([witness.u_px, witness.v_px])
         tip = at + (seen - at) * MAGNIFIED
-        cv2.arrowedLine(picture, _whole(at), _whole(tip), (30, 30, 230), 2, cv2.LINE_AA)
-        label = f"{witness.id}: {witness.error_mm * 1000:.0f} um"
-        cv2.putText(picture, label, (int(at[0]) + 30, int(at[1])), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (20, 20, 200), 2)
-    text = f"{alignment.marks}: rms {alignment.rms_mm:.3f} mm, worst {alignment.worst_mm:.3f} mm; arrows x{MAGNIFIED}"
-    cv2.putText(picture, text, (20, 40), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (20, 20, 200), 2)
-    return picture
+        cv2.arrowedLine(picture, _whole(at), _whole(tip), ERROR, 2, cv2.LINE_AA)
+        _label(picture, f"{witness.id}: {witness.error_mm * 1000:.0f} um", at)
+    text = f"{alignment.marks}: errors x{MAGNIFIED}, rms {alignment.rms_mm:.3f}, worst {alignment.worst_mm:.3f} mm"
+    return _explained(picture, [("20 mm of the machine", GRID), (text, ERROR)])
+
+
+def _label(picture: Picture, text: str, at: F64) -> None:
+    """Write a mark's text beside its centre, to the left of it where the right has no room."""
+    import cv2
+
+    scale = max(0.5, picture.shape[1] / 2000)
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 2)
+    aside = round(45 * scale)
+    left = int(at[0]) + aside if at[0] + aside + width < picture.shape[1] else int(at[0]) - aside - width
+    cv2.putText(picture, text, (left, int(at[1]) + height // 2), cv2.FONT_HERSHEY_SIMPLEX, scale, ERROR, 2, cv2.LINE_AA)
 
 
 def _whole(point: F64) -> tuple[int, int]:

@@ -232,6 +232,8 @@ def read_registration(path: Path) -> Registration:
         w, h = data["size_mm"]
         rms, worst, height = (float(data[key]) for key in ("rms_mm", "worst_mm", "height_mm"))
         size = (float(w), float(h))
+        if not np.isfinite([*size, height]).all():
+            raise ValueError("size_mm and height_mm must be finite numbers")
         return Registration(data["sheet"], size, affine, int(data["marks_count"]), rms, worst, height, data["made_utc"])
     except (KeyError, TypeError, ValueError) as fault:
         raise UsageError(

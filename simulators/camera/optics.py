@@ -5,6 +5,7 @@ Machine frame: x right, y up, z towards the camera. Camera frame: OpenCV's, z aw
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -62,11 +63,18 @@ def _tilt(angle_rad: float, towards_rad: float) -> F64:
 
 def rays(view: View, size_px: tuple[int, int]) -> tuple[F32, F32]:
     """Return the direction (x/z, y/z) that each sample of the picture looks along, SUPER samples a pixel."""
+    return _rays(tuple(view.K.ravel()), tuple(view.distortion), size_px)
+
+
+@functools.lru_cache(maxsize=1)  # one lens takes many pictures, and the arrays are large
+def _rays(K: tuple[float, ...], distortion: tuple[float, ...], size_px: tuple[int, int]) -> tuple[F32, F32]:
     w, h = size_px
     us, vs = np.arange(-COARSE_PX, w + 2 * COARSE_PX, COARSE_PX), np.arange(-COARSE_PX, h + 2 * COARSE_PX, COARSE_PX)
     grid = np.stack(np.meshgrid(us, vs), axis=-1).reshape(-1, 1, 2).astype(np.float64)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-    bare = cv2.undistortPoints(grid, view.K, view.distortion, criteria=criteria).reshape(len(vs), len(us), 2)
+    bare = cv2.undistortPoints(grid, np.reshape(K, (3, 3)), np.array(distortion), criteria=criteria).reshape(
+        len(vs), len(us), 2
+    )
     from scipy.interpolate import RectBivariateSpline
 
     fine_u = (np.arange(w * SUPER) + 0.5) / SUPER - 0.5

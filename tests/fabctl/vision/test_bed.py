@@ -166,6 +166,8 @@ def test_a_knocked_camera_is_noticed(alignment: Alignment, bed_picture: Picture)
 def test_an_old_alignment_is_refused(alignment: Alignment, bed_picture: Picture) -> None:
     now = datetime.fromisoformat(WHEN) + timedelta(days=31)
     assert [f.code for f in drift_findings(bed_picture, "bed", alignment, now)] == ["ALIGN-OLD"]
+    before = datetime.fromisoformat(WHEN) - timedelta(days=2)  # a clock that was wrong tells no age
+    assert [f.code for f in drift_findings(bed_picture, "bed", alignment, before)] == ["ALIGN-OLD"]
 
 
 def test_another_board_is_not_taken_for_ours(board_pictures: list[Picture]) -> None:
@@ -218,4 +220,8 @@ def test_the_job_is_drawn_where_it_will_be_cut(alignment: Alignment, bed_picture
     at = np.rint(alignment.to_pixels(np.array([[165.0, 90.0]]), 2.3)[0]).astype(int)
     patch = drawn[at[1] - 1 : at[1] + 2, at[0] - 1 : at[0] + 2].astype(int)
     assert (patch[..., 2] - patch[..., 0]).max() > 80
-    assert error_map(bed_picture, alignment).shape == (*bed_picture.shape, 3)
+    drawn = error_map(bed_picture, alignment)
+    h, w = bed_picture.shape
+    assert drawn.shape[1:] == (w, 3)
+    assert drawn.shape[0] > h  # a legend under it
+    assert (drawn[:h, -2:, 2].astype(int) - drawn[:h, -2:, 0] < 100).all()  # no label runs out of the picture

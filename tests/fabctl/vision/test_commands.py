@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,14 @@ from numpy.typing import NDArray
 from design.pattern.drawing import Drawing, as_json
 from drivers.errors import TransportError
 from fabctl.cli.main import cli
+from fabctl.config.bench import CameraConfig
 from fabctl.config.boards import config_of, load_board, write_board
 from fabctl.config.material import load_material
-from fabctl.errors import RefusedError, UsageError
+from fabctl.errors import USAGE, RefusedError, UsageError
 from fabctl.records.folder import start_run
 from fabctl.vision.bed import alignment_path, lens_path
 from fabctl.vision.lens import Lens, write_lens
+from fabctl.vision.register import read_registration
 from fabctl.workspace import Workspace
 from simulators.camera.picture import Studio
 from tests.fabctl.vision.conftest import BED, REGISTRATION, SHEET, WebCamera, bed_scene
@@ -66,6 +69,71 @@ def test_boards_are_written_and_their_measured_size_noted(fabctl: Fabctl, tmp_pa
     assert noted["ratio"] == pytest.approx([0.995, 1.0])
     sheet = load_board("registration", tmp_path).mark_sheet()
     assert sheet.marks[1].x_mm == pytest.approx(142 * 0.995)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("charuco", "--squares", "3x"), "whole numbers, such as 10x7"),
+        (("charuco", "--squares", "3.7x4.2"), "whole numbers, such as 10x7"),
+        (("charuco", "--squares", "3x2"), "3x3 squares at least"),
+        (("charuco", "--squares", "100x100"), "200 in all at most"),
+        (("charuco", "--name", "../lens"), "not a name"),
+        (("marks", "bed", "--size-mm", "300x"), "such as 300x200"),
+        (("marks", "bed", "--size-mm", "300x200", "--name", "A bed"), "not a name"),
+    ],
+)
+def test_a_board_that_cannot_be_is_refused_with_one_that_can(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    done = CliRunner().invoke(cli, ["--home", str(tmp_path), "camera", "board", *words])
+    assert done.exit_code == USAGE
+    assert said in done.output
+    assert not (tmp_path / "configs").exists()
+
+
+def test_pictures_of_another_size_are_named_in_a_calibration(
+    fabctl: Fabctl, tmp_path: Path, board_pictures: list[NDArray[np.uint8]]
+) -> None:
+    fabctl("camera", "board", "charuco")
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), board_pictures[k])
+    cv2.imwrite(str(tmp_path / "odd.png"), board_pictures[0][:600])
+    with pytest.raises(UsageError, match=r"3 pictures have 1050 x 725 px, but odd.png has 1050 x 600"):
+        fabctl("camera", "calibrate", "0.png", "odd.png", "1.png", "2.png")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"t_mm": [math.nan, 0.0, 800.0]},
+        {"height_mm": math.inf},
+        {"R": [[1.0, 0.0], [0.0, 1.0]]},
+        {"made_utc": "yesterday"},
+        {"made_utc": "2026-11-22T00:00:00"},
+    ],
+    ids=["no place", "no height", "flat", "no time", "no zone"],
+)
+def test_an_alignment_with_a_damaged_number_is_none(
+    fabctl: Fabctl, aligned: Path, tmp_path: Path, change: dict[str, object]
+) -> None:
+    path = alignment_path(Workspace(tmp_path).bench_state("sim"))
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(UsageError, match="not an alignment"):
+        fabctl("camera", "check", "--image", str(aligned))
+
+
+def test_a_registration_with_a_damaged_number_is_none(fabctl: Fabctl, aligned: Path, tmp_path: Path) -> None:
+    fabctl("camera", "register", "--thickness-mm", "2.3", "--image", str(aligned))
+    path = tmp_path / "registration.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "height_mm": math.nan}))
+    with pytest.raises(UsageError, match="not a registration"):
+        read_registration(path)
+
+
+def test_a_camera_may_be_a_bare_number_and_must_be_something() -> None:
+    assert CameraConfig.model_validate({"url": 0}).url == "0"
+    for nothing in ("", None, True):
+        with pytest.raises(ValueError, match="url"):
+            CameraConfig.model_validate({"url": nothing})
 
 
 def test_a_lens_is_calibrated_from_a_folder_of_pictures(

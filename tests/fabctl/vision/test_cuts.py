@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from design.export.gcode import GcodeOptions
+from design.findings import errors
 from design.pattern.paths import CutPath, LayerPreset
 from fabctl.errors import RefusedError, UsageError
 from fabctl.vision import coupon as coupons
@@ -118,6 +120,9 @@ def test_the_coupons_program_cuts_every_slit_at_its_power() -> None:
     assert coupons.coupon_from(coupons.coupon_data(COUPON), "here") == COUPON
     with pytest.raises(UsageError, match="powers_frac"):
         coupons.coupon_from({**coupons.coupon_data(COUPON), "powers_frac": "many"}, "here")
+    for change in ({"feed_mm_s": math.nan}, {"passes_count": 0}, {"format": 1}):
+        with pytest.raises(UsageError, match="here"):
+            coupons.coupon_from({**coupons.coupon_data(COUPON), **change}, "here")
 
 
 @pytest.mark.parametrize("blur_px", [0.5, 1.0, 2.0])
@@ -148,8 +153,11 @@ JOB.append(CutPath("outline", np.array([[2.0, 2.0], [58.0, 2.0], [58.0, 44.0], [
 MISSING, WEAK, MOVED = {3, 17}, {5, 20}, {9, 28}
 
 
+ToPixels = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
 @pytest.fixture(scope="module")
-def inspected() -> Inspection:
+def cut_sheet() -> tuple[NDArray[np.uint8], ToPixels]:
     jobs = []
     for k, path in enumerate(JOB):
         shifted = replace(path, points_mm=path.points_mm + (0.35 if k in MOVED else 0.0) * np.array([0.9, -0.45]))
@@ -163,6 +171,12 @@ def inspected() -> Inspection:
     def to_pixels(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         return studio.view.project(np.column_stack([points_mm, np.full(len(points_mm), 2.3)]))
 
+    return picture, to_pixels
+
+
+@pytest.fixture(scope="module")
+def inspected(cut_sheet: tuple[NDArray[np.uint8], ToPixels]) -> Inspection:
+    picture, to_pixels = cut_sheet
     return inspect(picture, JOB, to_pixels, 0.15)
 
 
@@ -173,6 +187,16 @@ def test_every_faulty_slit_is_named_and_no_other(inspected: Inspection) -> None:
     )
     assert states == expected
     assert {f.code for f in inspection_findings(inspected)} == {"CUT-MISSING", "CUT-NOT-THROUGH", "CUT-DISPLACED"}
+
+
+def test_a_job_that_lies_aside_as_a_whole_is_not_cut_as_designed(
+    cut_sheet: tuple[NDArray[np.uint8], ToPixels],
+) -> None:
+    picture, to_pixels = cut_sheet
+    found = inspect(picture, JOB, lambda points_mm: to_pixels(points_mm + np.array([0.2, -0.15])), 0.15)
+    assert found.shift_mm == pytest.approx((-0.2, 0.15), abs=0.03)
+    assert {path.index for path in found.faulty()} == MISSING | WEAK | MOVED  # of each its own fault, not the job's
+    assert "CUT-SHIFTED" in {f.code for f in errors(inspection_findings(found))}
 
 
 def test_displacement_is_measured(inspected: Inspection) -> None:

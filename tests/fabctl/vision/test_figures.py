@@ -38,3 +38,20 @@ def test_every_figure_is_told_as_soon_as_its_part_ends(
     monkeypatch.setattr(camera, "_kerf", later)
     camera.measure(["bed", "kerf"])
     assert "kept" in told[0]
+
+
+def test_a_part_takes_as_many_pictures_as_asked_and_by_itself_as_many_as_the_figure_needs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    counts: list[int] = []
+    monkeypatch.setattr(camera, "_nothing", lambda n: counts.append(n) or [])
+    camera.measure(["nothing"])
+    camera.measure(["nothing=24"])
+    camera.measure(["--quick", "nothing"])
+    assert counts == [1000, 24, 100]
+
+
+@pytest.mark.parametrize("word", ["nothign", "ids=many", "ids=0"])
+def test_a_part_that_is_none_is_named_and_nothing_runs(word: str) -> None:
+    with pytest.raises(SystemExit, match="PART=N"):
+        camera.measure([word])

@@ -15,7 +15,7 @@ import pytest
 from fabctl.cli.common import run_guarded
 from fabctl.cli.main import cli
 from fabctl.config.material import load_material
-from fabctl.errors import USAGE
+from fabctl.errors import REFUSED, USAGE
 from fabctl.testing import SimulatedBench, _bench
 from simulators.camera.burn import kerf_mm, read_trace
 from simulators.camera.picture import Studio
@@ -61,7 +61,13 @@ def test_a_coupon_is_cut_photographed_measured_and_its_kerf_used(laser_bench: Si
     w, h = made["size_mm"]
     (_, _, x), (_, _, y) = json.loads((run / "manifest.json").read_text())["config"]["placement"]
     photograph(state / "laser-trace.csv", (w, h), (x, y), tmp_path / "photo.png")
-    seen = laser_bench.fabctl("kerf", "measure", "photo.png", "--coupon", "c/coupon.json", "--write")
+    (known,) = laser_bench.fabctl("specimen", "read", "photo.png")["specimens"]
+    assert (known["id"], known["runs"]) == (done["specimen"], [done["run"]])
+    seen = laser_bench.fabctl("kerf", "measure", "photo.png", "--write")  # the id says which coupon it is
+    assert seen["specimen"] == done["specimen"]
+    laser_bench.fabctl("kerf", "coupon", "--material", "natural-rubber-2.3", "--powers", "0.5,0.8", "-o", "other")
+    laser_bench.fabctl("kerf", "measure", "photo.png", "--coupon", "other/coupon.json", expect=REFUSED)
+    laser_bench.fabctl("report", done["specimen"])
 
     true = [
         np.interp(0.6, [0.5, 0.7], [kerf_mm(p / 25.0, angle, BEAM) for p in (0.5, 0.7)]) for angle in (0, math.pi / 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from shapely import MultiLineString, distance, points
 
 from fabctl.config.boards import config_of, write_board
+from fabctl.errors import REFUSED
 from fabctl.simulated import stop
 from fabctl.testing import SimulatedBench
 from fabctl.vision.bed import alignment_path, lens_path
@@ -27,8 +29,9 @@ from tests.fabctl.vision.conftest import BED, CAMERA, REGISTRATION
 F64 = NDArray[np.float64]
 ZERO_MM = np.array([300.0, 200.0])  # where the laser's zero is on the bed
 LAID, TURNED = Pose(), Pose(0.0, 110.0, 45.0, 0.3)
-AT_MM = np.array([10.0, 18.0])
+AT_MM = (10.0, 18.0)
 SLITS = [((12 + 9 * c, 24 + 11 * r), (15 + 9 * c, 31 + 11 * r)) for c in range(12) for r in range(2)]
+SLITS_TOP_MM = 42.0
 DUMMIES = ("target.ply", "flat.ply", "cells.csv", "cut.dxf", "cut.svg", "cut.nc", "deployed.ply", "response.csv")
 
 
@@ -71,6 +74,10 @@ class Bench:
     def fabctl(self, *words: str, expect: int = 0) -> dict[str, Any]:
         return self.bench.fabctl(*words, expect=expect)
 
+    def refused(self, *words: str) -> set[str]:
+        """Return why the command is refused, by the codes of its findings."""
+        return {row["code"] for row in self.fabctl(*words, expect=REFUSED)["findings"]}
+
     def trace(self) -> F64:
         return read_trace(self.state / "laser-trace.csv") + np.array([0.0, *ZERO_MM, 0.0])
 
@@ -91,8 +98,8 @@ def bench(simulated_bench: SimulatedBench, lens: Lens) -> Bench:
     return Bench(simulated_bench, lens)
 
 
-def cut_words(design: Path) -> list[str]:
-    return ["cut", "run", str(design), "--origin", "camera", "--at-mm", *(f"{v:g}" for v in AT_MM), "--yes"]
+def cut_words(design: Path, at_mm: Sequence[float] = AT_MM) -> list[str]:
+    return ["cut", "run", str(design), "--origin", "camera", "--at-mm", *(f"{v:g}" for v in at_mm), "--yes"]
 
 
 @pytest.mark.slow
@@ -143,20 +150,29 @@ def test_a_knocked_camera_an_old_alignment_a_moved_sheet_and_no_camera_cut_nothi
     rows = len(bench.trace())
 
     bench.lay(replace(still, camera=replace(CAMERA, shift_mm=(0.4, 0.0))))
-    bench.fabctl(*cut_words(design), expect=3)  # ALIGN-DRIFT
+    assert "ALIGN-DRIFT" in bench.refused(*cut_words(design))
 
     bench.lay(still)
     path = alignment_path(bench.state)
     stored = path.read_text()
     path.write_text(json.dumps({**json.loads(stored), "made_utc": "2020-01-01T00:00:00+00:00"}))
-    bench.fabctl(*cut_words(design), expect=3)  # ALIGN-OLD
+    assert bench.refused(*cut_words(design)) == {"ALIGN-OLD"}
     path.write_text(stored)
 
-    bench.lay(replace(still, sheet=replace(sheet, poses=(*sheet.poses[:1], replace(sheet.poses[1], x_mm=111.0)))))
-    bench.fabctl(*cut_words(design), "--camera-file", "registration.json", expect=3)  # SHEET-MOVED
+    # Within the travel, but over the sheet's edge: the upper slits reach 1 mm beyond its 100 mm.
+    assert "SHEET-OUTLINE" in bench.refused(*cut_words(design, (AT_MM[0], 100.0 - SLITS_TOP_MM + 1.0)))
 
+    # The same marks on a sheet that ends 3 mm before its told right edge.
+    short = replace(sheet, size_mm=(REGISTRATION.size_mm[0] - 3.0, REGISTRATION.size_mm[1]))
+    bench.lay(replace(still, sheet=short))
+    assert bench.refused(*cut_words(design)) == {"SHEET-SHORT"}
+
+    bench.lay(replace(still, sheet=replace(sheet, poses=(*sheet.poses[:1], replace(sheet.poses[1], x_mm=111.0)))))
+    assert bench.refused(*cut_words(design), "--camera-file", "registration.json") == {"SHEET-MOVED"}
+
+    # Out of the travel, or with it the marks out of sight.
     bench.lay(replace(still, sheet=replace(sheet, poses=(LAID, replace(sheet.poses[1], x_mm=200.0, y_mm=120.0)))))
-    bench.fabctl(*cut_words(design), expect=3)  # out of the travel, or marks out of sight
+    assert bench.refused(*cut_words(design)) & {"CUT-X", "CUT-Y", "MARKS-FEW", "SHEET-SHORT"}
 
     bench.lay(still)
     stop(bench.state)
