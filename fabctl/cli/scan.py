@@ -14,9 +14,9 @@ from fabctl.cli.common import bench_option, json_option, lab, progress, say, see
 from fabctl.cli.paths import RUN, SPECIMEN_OR_FILE, InFile, InFolder, config_names
 from fabctl.cli.refusal import finding_of
 from fabctl.errors import REFUSED, FabctlError, RefusedError, Stopped, UsageError
+from fabctl.events import Event
 
 if TYPE_CHECKING:
-    from fabctl.events import Event
     from fabctl.records.folder import RunFolder
     from fabctl.scan.job import Request
     from fabctl.vision.boards import MarkSheet
