@@ -36,6 +36,13 @@ bench_option = click.option(
     show_default=True,
     help="Bench file or its name.",
 )
+seed_option = click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    default=0,
+    show_default=True,
+    help="The same seed gives the same scan and the same answer.",
+)
 PLACE_MM = click.FloatRange(-10_000, 10_000)  # of anything on a bench
 MATERIAL = config_names("materials")
 

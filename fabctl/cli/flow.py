@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from fabctl.bench import deployment_checklist, open_bench, refuse_without
-from fabctl.cli.common import bench_option, json_option, lab, progress, say, show, yes_option
+from fabctl.cli.common import bench_option, json_option, lab, progress, say, seed_option, show, yes_option
 from fabctl.cli.paths import SPECIMEN, InFile, config_names
 from fabctl.config.bench import find, load_bench
 from fabctl.config.method import load_method
@@ -35,13 +35,7 @@ from fabctl.flow import Flow, Order, continued, runner, steps_after_deployment, 
     show_default=True,
     help="Of the target's diagonal.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**32 - 1),
-    default=0,
-    show_default=True,
-    help="Same seed, same scan and same answer.",
-)
+@seed_option
 @bench_option
 @yes_option
 @json_option

@@ -87,8 +87,12 @@ def no_in_words(data: Mapping[str, Any], why: str) -> Iterator[str]:
     yield f"fabctl: {why}"
     for row in data.get("findings") or ():
         if row["level"] == "error":
-            found = Finding(row["code"], row["message"], row["level"], row["where"], row["hint"])
-            yield f"  {found}"
+            yield f"  {finding_of(row)}"
+
+
+def finding_of(row: Mapping[str, Any]) -> Finding:
+    """Return the finding that a result keeps as plain JSON, to be told in words."""
+    return Finding(row["code"], row["message"], row["level"], row["where"], row["hint"])
 
 
 def _findings(fault: BaseException) -> Iterator[dict[str, Any]]:

@@ -10,16 +10,28 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import bench_option, json_option, lab, progress, say, show
+from fabctl.cli.common import bench_option, json_option, lab, progress, say, seed_option, show
 from fabctl.cli.paths import RUN, SPECIMEN_OR_FILE, InFile, InFolder, config_names
+from fabctl.cli.refusal import finding_of
 from fabctl.errors import REFUSED, FabctlError, RefusedError, Stopped, UsageError
+from fabctl.events import Event
 
 if TYPE_CHECKING:
-    from fabctl.events import Event
     from fabctl.records.folder import RunFolder
     from fabctl.scan.job import Request
     from fabctl.vision.boards import MarkSheet
     from fabctl.workspace import Specimen, Workspace
+
+unit_option = click.option(
+    "--unit-mm",
+    type=click.FloatRange(0, 1e9, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Millimetres in one unit of the cloud, with --scale known.",
+)
+tolerance_option = click.option(
+    "--tolerance-frac", type=click.FloatRange(0, 10, min_open=True), help="Of the bounding-box diagonal."
+)
 
 
 @click.group()
@@ -42,13 +54,7 @@ def command() -> None:
     show_default=True,
     help="The cloud's scale: found from geometry, given by --unit-mm, or taken from a measured board.",
 )
-@click.option(
-    "--unit-mm",
-    type=click.FloatRange(0, 1e9, min_open=True),
-    default=1.0,
-    show_default=True,
-    help="Millimetres in one unit of the cloud, with --scale known.",
-)
+@unit_option
 @click.option(
     "--markers",
     type=InFile(),
@@ -77,14 +83,8 @@ def command() -> None:
     show_default=True,
     help="Rules of the alignment.",
 )
-@click.option("--tolerance-frac", type=click.FloatRange(0, 10, min_open=True), help="Of the bounding-box diagonal.")
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**32 - 1),
-    default=0,
-    show_default=True,
-    help="The same seed gives the same answer.",
-)
+@tolerance_option
+@seed_option
 @bench_option
 @json_option
 def run_scan(
@@ -116,7 +116,7 @@ def run_scan(
 
     here = lab()
     specimen, cloud = _named(here, words, target)
-    mesh = target if specimen is None else specimen.design / "target.ply"
+    mesh = target if specimen is None else _target_of(specimen)
     if mesh is None:
         raise UsageError("name a specimen, or give --target")
     if scale != "markers" and (bars or model):
@@ -160,21 +160,9 @@ def run_scan(
     show_default=True,
     help="The clouds' scale: found from geometry, or given by --unit-mm.",
 )
-@click.option(
-    "--unit-mm",
-    type=click.FloatRange(0, 1e9, min_open=True),
-    default=1.0,
-    show_default=True,
-    help="Millimetres in one unit of the cloud, with --scale known.",
-)
-@click.option("--tolerance-frac", type=click.FloatRange(0, 10, min_open=True), help="Of the bounding-box diagonal.")
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**32 - 1),
-    default=0,
-    show_default=True,
-    help="The same seed gives the same answer.",
-)
+@unit_option
+@tolerance_option
+@seed_option
 @json_option
 def run_batch(
     clouds: tuple[Path, ...],
@@ -253,6 +241,13 @@ def _named(here: Workspace, words: tuple[str, ...], target: Path | None) -> tupl
     if not SPECIMEN.fullmatch(words[0]) and Path(words[0]).is_file():
         raise UsageError(f"{words[0]} is a file; give the specimen first, or --target")
     return here.specimen(words[0]), Path(words[1]) if len(words) == 2 else None
+
+
+def _target_of(specimen: Specimen) -> Path:
+    mesh = specimen.design / "target.ply"
+    if not mesh.is_file():
+        raise UsageError(f"{specimen.name} was cut without a target surface, as coupons are: nothing to compare with")
+    return mesh
 
 
 def _fetch(here: Workspace, bench_name: str, specimen: Specimen, seed: int) -> tuple[Path, dict[str, Any]]:
@@ -376,5 +371,5 @@ def _lines(body: dict[str, Any], page: Path) -> list[str]:
             f"against the predicted shape: rms {model['rms_mm']:.3f} mm; "
             f"it knew {model['known_frac']:.0%} of the deviation"
         )
-    lines += [f"{f['level']} {f['code']}: {f['message']}" for f in body["findings"]]
+    lines += [str(finding_of(row)) for row in body["findings"]]
     return [*lines, f"report: {page}"]

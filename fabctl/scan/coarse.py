@@ -55,17 +55,22 @@ def starts(cloud: SearchCloud, target: SearchTarget, known_ratio: float | None, 
 
 def distinct(found: Poses, samples: Floats, apart: float, most: int) -> NDArray[np.int64]:
     """Return the best poses in order, none nearer than `apart` (rms over the samples) to a better one."""
-    order = np.argsort(found.score(), kind="stable")
+    places = _places(found, samples)
     kept: list[int] = []
-    images: list[Floats] = []
-    for k in order:
-        image = found.scale_ratio[k] * samples @ found.rotation[k].T + found.shift[k]
-        if all(float(((image - other) ** 2).sum(axis=1).mean()) > apart**2 for other in images):
+    for k in np.argsort(found.score(), kind="stable"):
+        if (np.sum((places[kept] - places[k]) ** 2, axis=1) > apart**2).all():
             kept.append(int(k))
-            images.append(image)
         if len(kept) == most:
             break
     return np.array(kept, dtype=np.int64)
+
+
+def _places(found: Poses, samples: Floats) -> Floats:
+    """Return a point (12,) for each pose, so that the points' distance is the rms distance of the samples' images."""
+    middle = samples.mean(axis=0)
+    root = np.linalg.cholesky(np.cov(samples.T, bias=True) + 1e-12 * np.eye(3) * np.ptp(samples) ** 2)
+    turn = found.scale_ratio[:, None, None] * found.rotation
+    return np.concatenate([(turn @ root).reshape(-1, 9), turn @ middle + found.shift], axis=1)
 
 
 def search(cloud: SearchCloud, target: SearchTarget, known_ratio: float | None, rotations: int = ROTATIONS) -> Poses:

@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 KEEP_CLOUD_FRAC, KEEP_TARGET_FRAC = 0.92, 0.7  # the rest is held at its edge: outliers, and what was not seen
 STRAY_RATIO = 0.12  # of the points in the cube about a usual point; a cube with fewer holds stray points
 EXPLAINED_FRAC = 0.025  # of the diagonal; a point nearer to the target than this is explained by the pose
+PAST_FRAC = 0.005  # of the diagonal; a point farther off the border than this lies past it
 WORST_RMS_FRAC = 0.02
 LEAST_COVERAGE_FRAC, LEAST_EXPLAINED_FRAC = 0.45, 0.75
 SURE_RMS_FRAC, SURE_COVERAGE_FRAC, SURE_EXPLAINED_FRAC = 0.008, 0.55, 0.88
@@ -33,6 +34,7 @@ class Judged:
     coverage_frac: float  # of the target's area, with a point near it
     explained_frac: float  # of the part's points, near the target
     relation: str = "found by the search"
+    past_frac: float = 0.0  # of the part's points, well past the target's border
 
     @property
     def pose(self) -> Similarity:
@@ -88,7 +90,8 @@ def judge(fit: Fit, points: Floats, dense: Floats, target: Target, relation: str
     """Return how well the fit lays the even samples `points` on the target, and the target on `dense`."""
     size = target.diagonal_mm
     placed = fit.pose(points)
-    away = np.linalg.norm(placed - target.closest(placed).points_mm, axis=1) / size
+    found = target.closest(placed)
+    away = np.linalg.norm(placed - found.points_mm, axis=1) / size
     grid = target.search
     samples = grid.grid.points[:3000]
     image = (fit.pose(dense) - target.centre_mm) / size
@@ -105,6 +108,7 @@ def judge(fit: Fit, points: Floats, dense: Floats, target: Target, relation: str
         float(near.mean()),
         float((away < EXPLAINED_FRAC).mean()),
         relation,
+        float((found.on_border & (away > PAST_FRAC)).mean()),
     )
 
 

@@ -45,6 +45,7 @@ CANDIDATES = 6
 LEAST_MEMBERS = 200
 MIRROR_BETTER_RATIO = 0.7
 MIRROR_DOUBT_FRAC = 0.005
+PAST_DOUBT = 0.02  # of the points past the border; so many speak against a pose that fits
 SAME_POSE_FRAC, NEAR_POSE_FRAC = 0.004, 0.06
 FINAL_ROUNDS, SETTLED_FRAC = 2, 1e-4  # of the diagonal
 PUSHES_FRAC = (-0.04, -0.015, 0.015, 0.04)
@@ -197,7 +198,7 @@ def register(task: Task) -> Registration:
         none = np.zeros(len(task.points), dtype=bool)
         return Registration("failed", None, (), None, none, task.symmetries, (finding,))
     body, found = min(fits, key=lambda t: (not t[1][0].plausible(), _merit(t[1][0])))
-    if found[0].score_frac > MIRROR_DOUBT_FRAC or not found[0].plausible():
+    if not found[0].plausible() or max(found[0].score_frac / MIRROR_DOUBT_FRAC, found[0].past_frac / PAST_DOUBT) > 1:
         # Where no part fits as it is, the merit of their poses says nothing about which one is the specimen.
         doubtful = [body] if found[0].plausible() else [b for b, _ in fits]
         for other in doubtful:
@@ -278,13 +279,21 @@ def _mirrored(task: Task, body: Body, best: Judged) -> tuple[Judged | None, Judg
     """
     task.emit(Event("stage", "aligning: the mirror image, to see whether it fits better"))
     image = poses_of(task, body, mirrored=True)
-    better = image and image[0].plausible() and image[0].score_frac < MIRROR_BETTER_RATIO * best.score_frac
-    if not better:
+    if not (image and image[0].plausible() and _fits_better(image[0], best)):
         return None, None
     mirrors = find_mirrors(task.target, task.symmetries)
     if not mirrors:
         return replace(image[0], relation="mirror image"), None
     return image[0], tried(task, body, mirrors[0].motion.after(image[0].pose))
+
+
+def _fits_better(image: Judged, best: Judged) -> bool:
+    """Return whether the mirror image fits much better, or as well and inside the border where the other sticks out.
+
+    The mirror image of a surface curved both ways may fit in itself, but its outline then lies askew.
+    """
+    inside = best.past_frac > PAST_DOUBT and image.past_frac < best.past_frac / 3
+    return image.score_frac < best.score_frac * (1.0 if inside else MIRROR_BETTER_RATIO)
 
 
 def _merit(judged: Judged) -> float:

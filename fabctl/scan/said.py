@@ -14,6 +14,7 @@ from fabctl.scan.symmetry import Symmetries
 from fabctl.scan.target import Target
 
 LIKE_SIZE_RATIO = 0.5  # of the specimen's cells; a cluster that large may be another specimen
+UNLIKE_SIZE_RATIO = 5.0  # no scan of the target is as much larger or smaller
 
 Status = Literal["aligned", "symmetric", "ambiguous", "failed", "mirrored"]
 
@@ -34,6 +35,16 @@ def left_aside(cleaned: Cleaned, part: Part) -> Iterator[Finding]:
         )
 
 
+def _why_no_fit(best: Judged, cleaned: Cleaned, part: Part, target: Target) -> str:
+    across_mm = best.pose.scale_ratio * float(np.linalg.norm(np.ptp(cleaned.cells.centre[part.cells], axis=0)))
+    if 1 / UNLIKE_SIZE_RATIO < across_mm / target.diagonal_mm < UNLIKE_SIZE_RATIO:
+        return "is it the right target and cloud, and is the specimen's own cloud large enough?"
+    return (
+        f"in this pose the cloud measures {across_mm:.3g} mm across, the target {target.diagonal_mm:.3g} mm; "
+        "with --scale known: is --unit-mm right?"
+    )
+
+
 def findings_of(
     status: Status,
     best: Judged,
@@ -49,7 +60,7 @@ def findings_of(
             "SCAN-NO-FIT",
             f"no pose explains the cloud: the best leaves {best.score_frac:.2%} of the diagonal (rms), covers "
             f"{best.coverage_frac:.0%} of the target and explains {best.explained_frac:.0%} of the points",
-            hint="is it the right target and cloud, and is the specimen's own cloud large enough?",
+            hint=_why_no_fit(best, cleaned, part, target),
         )
     if status == "mirrored":
         yield Finding(
@@ -75,7 +86,7 @@ def findings_of(
             )
     if status in ("aligned", "symmetric"):
         yield from left_aside(cleaned, part)
-    if status in ("aligned", "symmetric", "ambiguous") and cleaned.table is not None:
+    if status in ("aligned", "symmetric", "ambiguous") and cleaned.table is not None and "plane kept" not in part.name:
         up = best.pose.rotation @ cleaned.table.normal
         area = target.mesh.face_areas_mm2()
         a, b, c = (target.mesh.vertices_mm[target.mesh.faces[:, k]] for k in range(3))

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from design.targets import pierced_cap
+from fabctl.scan import register as registering
 from fabctl.scan.borders import Circle, borne_out, circle, rim_axis
 from fabctl.scan.clean import clean
 from fabctl.scan.decide import decide_by_border
@@ -18,7 +19,7 @@ from fabctl.scan.markers import scale_from_board
 from fabctl.scan.paint import chosen_by_paint, paint_of
 from fabctl.scan.painted import marks_on_table
 from fabctl.scan.refine import Fit, Rows
-from fabctl.scan.register import Task, register
+from fabctl.scan.register import Task, register, tried
 from fabctl.scan.similarity import IDENTITY, Similarity, rotation_of
 from fabctl.scan.symmetry import Symmetries
 from fabctl.scan.target import Target
@@ -123,6 +124,18 @@ def test_a_gap_about_as_large_as_the_hole_never_passes_for_it(radius_frac: float
     points = gap_at(gap_at(scattered(40_000), 0.0, 0.14), 2.0, radius_frac)
     off = Similarity(rotation_of(np.array([0.0, 0.0, -2.0])), np.zeros(3))
     assert decided(points, [off, IDENTITY]) is None
+
+
+@pytest.mark.parametrize(("hidden", "status"), [(True, "ambiguous"), (False, "aligned")])
+def test_a_pose_found_alone_is_not_trusted_while_the_border_allows_another_turn(
+    hidden: bool, status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search and the pushes miss the rival: the hole seen through a gap, another gap where it might be as well."""
+    points = gap_at(gap_at(scattered(40_000), 0.0, 0.14), 2.0, 0.14) if hidden else scattered(40_000)
+    task = Task(points, clean(points), PIERCED, Symmetries((), None, None))
+    monkeypatch.setattr(registering, "poses_of", lambda task, body: [tried(task, body, IDENTITY)])
+    monkeypatch.setattr(registering, "pushed", lambda task, body, best: [])
+    assert register(task).status == status
 
 
 def decided(points: np.ndarray, poses: list[Similarity]) -> Judged | None:

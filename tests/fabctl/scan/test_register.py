@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from design.surface import TriMesh
 from design.targets import vase
 from fabctl.scan.clean import clean
 from fabctl.scan.decide import Datums
-from fabctl.scan.refine import patch_rows
+from fabctl.scan.judge import Judged
+from fabctl.scan.refine import Fit, Rows, patch_rows
 from fabctl.scan.register import Registration, Task, register, specimen_points
-from fabctl.scan.said import left_aside
+from fabctl.scan.said import findings_of, left_aside
 from fabctl.scan.similarity import IDENTITY, Similarity
 from fabctl.scan.symmetry import find_symmetries
 from fabctl.scan.target import Target
-from simulators.photogrammetry import ScanPlan
+from simulators.photogrammetry import ScanPlan, sample_mesh
 from tests.fabctl.scan.conftest import TARGETS, scanned, symmetries_of, true_pose
 
 RAW = ScanPlan(seed=3, unseen_frac=0.3, points_count=20_000)
@@ -68,10 +72,46 @@ def test_a_mirror_image_is_named() -> None:
     assert [f.code for f in found.findings] == ["SCAN-MIRROR"]
 
 
+def test_a_mirror_image_that_fits_askew_is_named() -> None:
+    """A quadric turned by twice its own slant is its mirror image, apart from the outline."""
+    u, v = (np.linspace(-1, 1, 30)[k] for k in np.indices((30, 30)).reshape(2, -1))
+    corner = (np.arange(29)[:, None] * 30 + np.arange(29)).ravel()
+    faces = np.concatenate([np.stack([corner, corner + 30, corner + 1], 1), corner[:, None] + [1, 30, 31]])
+    vertices = np.stack([70 * u, 50 * v, 25 * u**2 - 18 * v**2 + 6 * u * v + 4 * u**3], axis=1)
+    target = Target(TriMesh(vertices, faces), "twisted saddle")
+    rng = np.random.default_rng(4)
+    points, normals = sample_mesh(vertices, faces, 12_000, rng)
+    points = points + 0.15 * rng.normal(size=(len(points), 1)) * normals
+    symmetries = find_symmetries(target)
+    assert register(Task(points, clean(points), target, symmetries)).status == "aligned"
+    mirrored = points * [1.0, 1.0, -1.0]
+    assert register(Task(mirrored, clean(mirrored), target, symmetries)).status == "mirrored"
+
+
+def test_a_plane_that_belongs_to_the_specimen_says_nothing_about_its_side() -> None:
+    cleaned = clean(scanned("cap", RAW).points, 3)
+    over = Similarity(np.diag([1.0, -1.0, -1.0]), np.zeros(3), 1.0).after(true_pose(scanned("cap", RAW)))
+    nothing = Rows(np.zeros((0, 7)), np.zeros(0), np.zeros(0), np.zeros(0))
+    judged = Judged(Fit(over, nothing, None, np.zeros(0), np.zeros(0), 0.0, 0, 0.0), 0.001, 0.001, 0.7, 1.0)
+    for name, said in ((cleaned.parts[0].name, True), ("largest cluster with its plane kept", False)):
+        part = replace(cleaned.parts[0], name=name)
+        found = findings_of("aligned", judged, (), part, cleaned, symmetries_of("cap"), TARGETS["cap"])
+        assert ("SCAN-OTHER-SIDE" in [f.code for f in found]) is said
+
+
 def test_an_unrelated_cloud_is_refused() -> None:
     made = scanned("cap", RAW)
     found = register(Task(made.points, clean(made.points), TARGETS["freeform"], symmetries_of("freeform")))
     assert found.status == "failed"
+
+
+def test_a_cloud_in_another_unit_is_refused_with_both_sizes() -> None:
+    points = 1e-3 * TARGETS["freeform"].even_samples(3000)[0]
+    task = Task(points, clean(points), TARGETS["freeform"], symmetries_of("freeform"), scale_ratio=1.0)
+    found = register(task)
+    assert found.status == "failed"
+    assert "--unit-mm" in found.findings[0].hint
+    assert f"{TARGETS['freeform'].diagonal_mm:.3g} mm" in found.findings[0].hint
 
 
 def test_coordinates_far_from_the_origin_change_nothing() -> None:
