@@ -39,9 +39,11 @@ def follow(laser: Laser, program: Program, rows: list[str]) -> None:
     run_plan(laser, plan, RUN_ON_S, silent)
 
 
-def killed_run(seed: int, program: Program, absence_s: float | None = None) -> tuple[Rig, list[str], float]:
+def killed_run(
+    seed: int, program: Program, absence_s: float | None = None, rig: Rig | None = None
+) -> tuple[Rig, list[str], float]:
     """Return a board whose host died in mid-job, the host's log, and when it died."""
-    rig, rows, rng = Rig(), list[str](), random.Random(seed)
+    rig, rows, rng = rig or Rig(), list[str](), random.Random(seed)
     laser = host(rig, rows)
     assert laser.identity is not None
     total_s = program_times(program, laser.identity).total_s

@@ -30,7 +30,7 @@ class BoardRestarted(DeviceError):
         self.banner = banner
 
     def __str__(self) -> str:
-        return f"{WHO} restarted in mid-job ({self.banner}); position lost; home it, look at the sheet, then resume"
+        return f"{WHO} restarted in mid-job ({self.banner}); position lost; home it and look at the sheet"
 
 
 class LostOk(ProtocolError):
@@ -43,7 +43,7 @@ class LostOk(ProtocolError):
     def __str__(self) -> str:
         return (
             f"{WHO} has done everything it was sent, but {self.outstanding_count} of the lines were never answered: "
-            "an answer was lost; check the cable, then resume"
+            "an answer was lost; check the cable"
         )
 
 
@@ -55,7 +55,7 @@ class DoubledOk(ProtocolError):
         self.evidence = evidence
 
     def __str__(self) -> str:
-        return f"{WHO} answered a line that was never sent ({self.evidence}); check the cable, then resume"
+        return f"{WHO} answered a line that was never sent ({self.evidence}); check the cable"
 
 
 class GarbledLine(ProtocolError):
@@ -66,7 +66,7 @@ class GarbledLine(ProtocolError):
         self.text = text
 
     def __str__(self) -> str:
-        return f"{WHO} sent {self.text!r}, which is no answer: the line is disturbed; check the cable, then resume"
+        return f"{WHO} sent {self.text!r}, which is no answer: the line is disturbed; check the cable"
 
 
 class LinkStalled(DeviceTimeout):

@@ -74,6 +74,7 @@ class Laser:
         buffer; only then lines. Raise `ProtocolError` where what answers is not a GRBL board.
         """
         self._quiet = False
+        self.link.unit_mm = 1.0  # until it is known: `_identify` reads the board's own words
         self._wake()
         if not self._stand_still():
             self.link.garbled.append("(still moving)")
@@ -86,6 +87,7 @@ class Laser:
         self.link.wait_for(lambda _: False, SETTLE_S)
         self.identity = self._identify(banner)
         self.link.firmware = self.identity.firmware
+        self.link.unit_mm, self.link.offset_mm = self.identity.unit_mm, self.identity.work_offset_mm()
         self._quiet = True
         return self.identity
 

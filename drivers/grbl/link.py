@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from drivers.clock import Clock
 from drivers.errors import DeviceAlarm, DeviceRefused, DeviceTimeout
 from drivers.grbl.faults import WHO, BoardRestarted
 from drivers.grbl.meanings import alarm_meaning, error_meaning
-from drivers.grbl.messages import Alarm, Banner, Error, Garbled, Listener, Message, Ok, Report
+from drivers.grbl.messages import Alarm, Banner, Error, Garbled, Listener, Message, Ok, Report, Vector
 from drivers.transport import Transport
 
 STATUS, START, HOLD, RESET = b"?", b"~", b"!", b"\x18"
@@ -24,7 +25,11 @@ def alarm(code: int, firmware: str = "grbl") -> DeviceAlarm:
 
 
 class Link:
-    """Messages over a transport. Every report seen is kept as `report`; the last work offset as `offset_mm`."""
+    """Messages over a transport, their lengths in mm. The last report is kept as `report`, with its machine place.
+
+    `unit_mm` is what the board counts in (`$13`), `offset_mm` its work offset: known once identified. Overrides are
+    told in every few reports and whenever they change: the others carry the last ones.
+    """
 
     def __init__(self, transport: Transport, clock: Clock) -> None:
         self.transport, self.clock = transport, clock
@@ -32,6 +37,9 @@ class Link:
         self.report: Report | None = None
         self.reported_s = 0.0
         self.garbled: list[str] = []
+        self.unit_mm = 1.0
+        self.offset_mm: Vector | None = None
+        self.overrides: tuple[int, int, int] | None = None
         self.firmware = "grbl"  # whose numbers `error:` and `ALARM:` are; known once identified
 
     def send(self, data: bytes) -> None:
@@ -40,13 +48,25 @@ class Link:
 
     def receive(self, timeout_s: float) -> list[Message]:
         """Return the messages that have come, waiting at most `timeout_s`."""
-        found = self.listener.feed(self.transport.read(timeout_s))
+        came = self.listener.feed(self.transport.read(timeout_s))
+        found = [self._whole(message) if isinstance(message, Report) else message for message in came]
         for message in found:
             if isinstance(message, Report):
                 self.report, self.reported_s = message, self.clock.now_s()
+            elif isinstance(message, Banner):
+                self.overrides = None
             elif isinstance(message, Garbled):
                 self.garbled.append(message.text)
         return found
+
+    def _whole(self, report: Report) -> Report:
+        if self.unit_mm != 1.0:
+            report = report.scaled(self.unit_mm)
+        if report.offset_mm is not None:
+            self.offset_mm = report.offset_mm
+        self.overrides = report.overrides or self.overrides
+        report = replace(report, overrides=self.overrides)
+        return report.placed(self.offset_mm) if self.offset_mm is not None else report
 
     def drain(self) -> None:
         """Throw away what has come in so far."""

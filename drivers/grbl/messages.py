@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 Vector = tuple[float, float, float]
 
@@ -80,7 +80,10 @@ class Garbled:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """An answer to `?`. Absent fields were not in it; positions are in mm unless the board reports inches."""
+    """An answer to `?`. Absent fields were not in it.
+
+    As parsed, lengths are what the board calls them: inches with `$13=1`. `Link` hands out mm only.
+    """
 
     state: str
     substate: int | None = None
@@ -94,6 +97,23 @@ class Report:
     overrides: tuple[int, int, int] | None = None
     accessories: str | None = None
     pins: str = ""
+
+    def scaled(self, unit_mm: float) -> Report:
+        """Return the report in mm, where the board counts in units of `unit_mm`."""
+        return replace(
+            self,
+            machine_mm=scaled(self.machine_mm, unit_mm) if self.machine_mm else None,
+            work_mm=scaled(self.work_mm, unit_mm) if self.work_mm else None,
+            offset_mm=scaled(self.offset_mm, unit_mm) if self.offset_mm else None,
+            feed_mm_min=self.feed_mm_min * unit_mm if self.feed_mm_min is not None else None,
+        )
+
+    def placed(self, offset_mm: Vector) -> Report:
+        """Return the report with its machine place also where it tells only the work place (`$10=0`)."""
+        if self.machine_mm is not None or self.work_mm is None:
+            return self
+        (x, y, z), (dx, dy, dz) = self.work_mm, offset_mm
+        return replace(self, machine_mm=(x + dx, y + dy, z + dz))
 
     @property
     def moving(self) -> bool:
@@ -110,14 +130,21 @@ class Report:
         return self.state in ("Idle", "Alarm", "Check", "Sleep")
 
 
+def scaled(place: Vector, unit_mm: float) -> Vector:
+    """Return a place in mm, where it is told in units of `unit_mm`."""
+    x, y, z = place
+    return x * unit_mm, y * unit_mm, z * unit_mm
+
+
 Message = Ok | Error | Alarm | Banner | Setting | Startup | Info | StartupRun | Garbled | Report
 
 REPORT = re.compile(r"<([^<>]*)>")
-SETTING = re.compile(r"\$(\d+)=(.*)")
-STARTUP = re.compile(r"\$N(\d+)=(.*)")
-CODED = re.compile(r"(error|ALARM):(\d+)")
+# Of numbers at most nine digits: more is noise, and Python reads no integer of thousands of them.
+SETTING = re.compile(r"\$(\d{1,9})=(.*)")
+STARTUP = re.compile(r"\$N(\d{1,9})=(.*)")
+CODED = re.compile(r"(error|ALARM):(\d{1,9})")
 BANNER = re.compile(r"Grbl(HAL)? \d\S* .*\[.*help.*\]", re.IGNORECASE)
-STATE = re.compile(r"([A-Z][a-z]+)(?::(\d+))?")
+STATE = re.compile(r"([A-Z][a-z]+)(?::(\d{1,9}))?")
 STATES = ("Idle", "Run", "Hold", "Jog", "Home", "Alarm", "Check", "Door", "Sleep", "Tool")
 
 

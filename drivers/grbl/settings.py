@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from drivers.grbl.messages import Banner, Info, Message, Report, Setting, Startup, Vector, finite
+from drivers.grbl.messages import Banner, Info, Message, Report, Setting, Startup, Vector, finite, scaled
 
 RX_FALLBACK_BYTES = 128
 RX_LEAST_BYTES = 16
 PLANNER_FALLBACK_COUNT = 15
+INCH_MM = 25.4
 
 
 class Settings(dict[int, float]):
@@ -48,6 +49,11 @@ class Identity:
         """Return whether positions come in inches (`$13`)."""
         return self.is_on(13)
 
+    @property
+    def unit_mm(self) -> float:
+        """Return the length in mm of the unit that the board reports places in."""
+        return INCH_MM if self.reports_inches else 1.0
+
     def work_offset_mm(self) -> Vector:
         """Return machine minus work position of the active coordinate system, as `$#` and `$G` say."""
         active = next((word for word in self.modes.split() if word in self.offsets_mm and word != "G92"), "G54")
@@ -59,8 +65,8 @@ class Identity:
 def identify(messages: Iterable[Message], idle: Report | None) -> Identity:
     """Return the identity that the answers to `$I $$ $# $G $N` amount to.
 
-    The receive buffer is the third field of `[OPT:…,blocks,bytes]` (the second is planner blocks); where absent, the
-    free bytes of an idle `Bf:`; else 128.
+    The receive buffer is the third field of `[OPT:…,blocks,bytes]` (the second is planner blocks), or the free bytes of
+    an idle `Bf:`: of both the smaller (ring buffers hold a byte less than their size), of neither 128.
     """
     version = options = modes = ""
     firmware = "grbl"
@@ -87,13 +93,19 @@ def identify(messages: Iterable[Message], idle: Report | None) -> Identity:
                 modes = message.text
             elif message.kind.startswith("G") and "," in message.text:
                 offsets |= _offset(message)
-    rx_bytes = int(fields[1]) if len(fields) > 1 and fields[1].isdecimal() and len(fields[1]) < 7 else None
-    if rx_bytes is None and idle is not None and idle.state == "Idle":
-        rx_bytes = idle.free_bytes
-    if rx_bytes is None or rx_bytes < RX_LEAST_BYTES:
-        rx_bytes = RX_FALLBACK_BYTES
+    if settings.get(13):
+        offsets = {name: scaled(place, INCH_MM) for name, place in offsets.items()}
+    rx_bytes = _rx_bytes(fields[1] if len(fields) > 1 else "", idle)
     blocks = int(fields[0]) if fields and fields[0].isdecimal() and len(fields[0]) < 7 else PLANNER_FALLBACK_COUNT
     return Identity(firmware, version, options, rx_bytes, blocks, settings, offsets, modes, tuple(startup))
+
+
+def _rx_bytes(told: str, idle: Report | None) -> int:
+    """Return how many bytes may be out: the smaller of what the build says and what is free while nothing waits."""
+    sizes = [int(told)] if told.isdecimal() and len(told) < 7 else []
+    if idle is not None and idle.state in ("Idle", "Alarm") and idle.free_bytes is not None:
+        sizes.append(idle.free_bytes)
+    return min((size for size in sizes if size >= RX_LEAST_BYTES), default=RX_FALLBACK_BYTES)
 
 
 def _firmware(text: str, before: str) -> str:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import ipaddress
 import select
 import socket
+import sys
 
 from drivers.errors import TransportError
 
@@ -12,16 +15,17 @@ WRITE_TIMEOUT_S = 1.0
 
 
 class TcpTransport:
-    """One TCP connection, every byte sent at once."""
+    """One TCP connection, every byte sent at once. A second opener on this machine is told that it is in use."""
 
     def __init__(self, host: str, port: int, url: str) -> None:
         self.url = url
+        self._claim = socket.socket(socket.AF_UNIX)
         try:
+            claim(self._claim, host, port)
             self._socket = socket.create_connection((host, port), timeout=CONNECT_S)
-        except TimeoutError as fault:
-            raise TransportError(url, f"no answer within {CONNECT_S:g} s", "is the device on the network?") from fault
         except OSError as fault:
-            raise TransportError(url, fault.strerror or str(fault), "is the device on, and the port right?") from fault
+            self._claim.close()
+            raise TransportError(url, *_why(fault)) from fault
         self._socket.settimeout(WRITE_TIMEOUT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -48,5 +52,27 @@ class TcpTransport:
         return data
 
     def close(self) -> None:
-        """End the connection."""
+        """End the connection, and give the device free."""
         self._socket.close()
+        self._claim.close()
+
+
+def claim(sign: socket.socket, host: str, port: int) -> None:
+    """Take the device at an address for this process, before anything of it is touched; raise `OSError` where it is.
+
+    The sign is a name in Linux's abstract socket space: it counts for everybody on this machine, and ends with the
+    process, however that ends. Elsewhere only the bench's own lock counts.
+    """
+    address = ipaddress.ip_address(
+        str(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][4][0]).partition("%")[0]
+    )
+    if sys.platform == "linux":
+        sign.bind(f"\0fabctl-device-{'loopback' if address.is_loopback else address}-{port}")
+
+
+def _why(fault: OSError) -> tuple[str, str]:
+    if fault.errno == errno.EADDRINUSE:
+        return "the device is in use by another program", "close the other sender"
+    if isinstance(fault, TimeoutError):
+        return f"no answer within {CONNECT_S:g} s", "is the device on the network?"
+    return fault.strerror or str(fault), "is the device on, and the port right?"

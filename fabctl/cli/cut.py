@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from fabctl.cli.common import (
     MATERIAL,
@@ -22,6 +23,8 @@ from fabctl.cli.common import (
 from fabctl.cli.cut_camera import marks_command
 from fabctl.cli.cut_inspect import inspect_command
 from fabctl.cli.paths import RUN, InFile, InFolder, config_names
+
+CAMERA_ONLY = ("marks", "at_mm", "image", "camera_file")
 
 
 @click.group("cut", no_args_is_help=True)
@@ -42,7 +45,8 @@ command.add_command(marks_command)
     type=click.Choice(["home", "here", "camera"]),
     default="home",
     show_default=True,
-    help="Where the sheet's corner is: in the corner of the travel, where the head is, or as the camera sees it.",
+    help="Where the sheet's corner is: in the corner of the travel (with --resume: where it was), where the head is, "
+    "or as the camera sees it.",
 )
 @click.option(
     "--marks",
@@ -88,6 +92,7 @@ def run(
     """
     from dataclasses import replace
 
+    _refuse_idle_options(origin, resume_run is not None)
     from fabctl.bench import open_bench
     from fabctl.cli.cut_camera import eye_of
     from fabctl.config.bench import load_bench
@@ -95,12 +100,17 @@ def run(
     from fabctl.cut.compose import SPOT_MM, composer, open_design, sheet_of
     from fabctl.cut.job import CutOrder, Desk, cut
     from fabctl.cut.keyboard import HELP, keyboard
+    from fabctl.cut.resume import material_of, resume
 
     home = lab()
+    before = home.run(resume_run) if resume_run is not None else None
     if (design / "coupon.json").is_file():
         raise click.UsageError(f"{design} is a kerf coupon: fabctl kerf cut {design}")
     bundle, spec = open_design(design)
-    chosen = load_material(material or spec.material, home.root)
+    if before is not None and material is None:
+        chosen = material_of(before)
+    else:
+        chosen = load_material(material or spec.material, home.root)
     config = load_bench(bench_name, home.root)
     spot_mm = config.laser.spot_mm if config.laser is not None else SPOT_MM
     order = CutOrder(
@@ -115,15 +125,13 @@ def run(
         home=not no_home,
     )
     with open_bench(home, config, f"cut {design.name}") as bench, keyboard() as keys:
-        if origin == "camera" and resume_run is None:
+        if origin == "camera":
             order = replace(order, eye=eye_of(bench, marks, at_mm, chosen.thickness_mm, camera_file, image))
         desk = Desk(lambda question: confirm(question, yes), progress(), keys)
         if not dry_run:
             say_keys(HELP)
-        if resume_run is not None:
-            from fabctl.cut.resume import resume
-
-            done = resume(home, bench, order, home.run(resume_run).path, desk, dry_run)
+        if before is not None:
+            done = resume(home, bench, order, before.path, desk, dry_run)
         else:
             done = cut(home, bench, order, desk, dry_run)
     facts: dict[str, Any] = {
@@ -133,6 +141,17 @@ def run(
         **done.result,
     }
     show(facts, as_json, _lines(facts))
+
+
+def _refuse_idle_options(origin: str, resuming: bool) -> None:
+    """Refuse, all at once, the options that were given and would change nothing."""
+    source = click.get_current_context().get_parameter_source
+    given = [name for name in (*CAMERA_ONLY, "sheet") if source(name) is ParameterSource.COMMANDLINE]
+    said = [f"--{n.replace('_', '-')} needs --origin camera" for n in given if n != "sheet" and origin != "camera"]
+    if resuming and "sheet" in given:
+        said.append("--sheet means nothing with --resume: the run goes on with its own sheet")
+    if said:
+        raise click.UsageError("; ".join(said))
 
 
 def _lines(facts: dict[str, Any]) -> list[str]:

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
+from fabctl.cli.common import MATERIAL, F, bench_option, confirm, json_option, lab, progress, say_keys, show, yes_option
 from fabctl.cli.paths import config_names
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from fabctl.bench import Bench
     from fabctl.cut.by_camera import BedEye
     from fabctl.cut.job import CutDone, CutOrder
-
-FC = TypeVar("FC", bound="Callable[..., Any] | click.Command")
 
 
 def eye_of(
@@ -63,23 +59,17 @@ def _is_registration(path: Path) -> bool:
     return isinstance(data, dict) and "sheet" in data
 
 
-def plain_options(what: str) -> Callable[[FC], FC]:
-    """Return the options of a job for `plain_job`, which cuts `what`."""
-    place = f"Where the {what}'s corner lies: in the corner of the travel, or where the head is."
-    options = (
-        click.option("--origin", type=click.Choice(["home", "here"]), default="home", show_default=True, help=place),
-        click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves."),
-        bench_option,
-        yes_option,
-        json_option,
+def plain_job_options(command: F) -> F:
+    """Give a command what every job that is no design takes."""
+    origin = click.option(
+        "--origin",
+        type=click.Choice(["home", "here"]),
+        default="home",
+        show_default=True,
+        help="Where the job's corner lies: in the corner of the travel, or where the head is.",
     )
-
-    def add(command: FC) -> FC:
-        for option in reversed(options):
-            command = option(command)
-        return command
-
-    return add
+    dry_run = click.option("--dry-run", is_flag=True, help="Plan and check only; nothing moves.")
+    return origin(dry_run(bench_option(yes_option(json_option(command)))))
 
 
 @click.command("marks")
@@ -87,7 +77,7 @@ def plain_options(what: str) -> Callable[[FC], FC]:
 @click.option(
     "--material", type=MATERIAL, required=True, help="Material file or its name; its preset gives power and speed."
 )
-@plain_options("board")
+@plain_job_options
 def marks_command(
     board: str, material: str, origin: str, dry_run: bool, bench_name: str, yes: bool, as_json: bool
 ) -> None:

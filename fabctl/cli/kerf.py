@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fabctl.cli.common import MATERIAL, bench_option, json_option, lab, say, show
-from fabctl.cli.cut_camera import plain_job, plain_options
+from fabctl.cli.cut_camera import plain_job, plain_job_options
 from fabctl.cli.finite import numbers
 from fabctl.cli.paths import InFile, InFolder, OutFolder
 
@@ -74,7 +74,7 @@ def coupon(material: str, powers: str | None, output: Path, bench_name: str, as_
 
 @command.command("cut")
 @click.argument("folder", type=InFolder())
-@plain_options("coupon")
+@plain_job_options
 def cut_coupon(folder: Path, origin: str, dry_run: bool, bench_name: str, yes: bool, as_json: bool) -> None:
     """Cut the coupon in FOLDER: the same checks, the same question and the same record as any cut."""
     from design.export.gcode import GcodeOptions

@@ -57,7 +57,7 @@ def sentence_of(fault: BaseException) -> str:
         return "stopped by the operator"
     if isinstance(fault, OSError) and not isinstance(fault, DeviceError):
         return f"{fault.filename or 'storage'}: {words_of(fault)}"
-    return str(fault)
+    return "\n".join([str(fault), *getattr(fault, "__notes__", ())])  # what can be done about it, where that is known
 
 
 def words_of(fault: OSError) -> str:

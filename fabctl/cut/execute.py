@@ -31,7 +31,7 @@ class OffPath(DeviceError):
         x, y = self.place_mm
         return (
             f"the laser reports X{x:.2f} Y{y:.2f}, {self.off_mm:.2f} mm off the program's path; the beam is off; "
-            "home it and look at the sheet before resuming"
+            "home it and look at the sheet"
         )
 
 

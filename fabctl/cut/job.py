@@ -5,21 +5,18 @@ Everything is asked before the first motion. On every way out the beam is off an
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any, Protocol
 
 from design.findings import Finding, errors
 from drivers.clock import WallClock
-from drivers.errors import DeviceError
 from drivers.grbl.laser import Laser
 from drivers.grbl.messages import Info, Report
-from drivers.grbl.run import StoppedByOperator, Wish
+from drivers.grbl.run import Wish
 from drivers.grbl.settings import Identity, identify
 from drivers.transport import open_transport
 from drivers.transport.tap import Tap
@@ -28,15 +25,16 @@ from fabctl.config.bench import BenchConfig, LaserConfig
 from fabctl.config.material import MaterialConfig
 from fabctl.cut.execute import check_on_board, minutes, no_keys, run_plan
 from fabctl.cut.kept import design_files, kept
-from fabctl.cut.place import Affine, Origin, homed_mm, placement
+from fabctl.cut.place import Affine, Origin, after_homing, is_homed, placement
 from fabctl.cut.plan import CutPlan, frame_lines, plan_cut, program_times
 from fabctl.cut.preflight import Sheet
 from fabctl.cut.program import read_program
+from fabctl.cut.recorded import recorded
 from fabctl.cut.trail import PROGRAM_BEGINS
 from fabctl.cut.wirelog import WireLog
-from fabctl.errors import FabctlError, RefusedError, Stopped, UsageError
+from fabctl.errors import RefusedError, Stopped, UsageError
 from fabctl.events import Emit, Event
-from fabctl.records.folder import RunFolder, start_run, write_atomically
+from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Specimen, Workspace
 
 SAMPLE_ID = "S-0000"  # stands for the id until the operator has said yes
@@ -140,13 +138,13 @@ def cut(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, dry_run: bool
                 plan = _plan(laser, bench, order, SAMPLE_ID)
                 if any(finding.code == "CUT-ZERO" for finding in plan.findings):
                     order = replace(order, frame=True)  # where zero is, only the operator knows: let it be seen
-                _tell_findings(plan.findings, desk.emit)
+                tell_warnings(plan.findings, desk.emit)
                 _refuse(plan.findings)
                 if dry_run:
                     if order.check and laser.report().state == "Idle":
                         check_on_board(laser, plan.lines)
                     return CutDone(plan, None, None, summary(plan, identity_of(laser)))
-                if not desk.ask(question(plan, order, laser_config(bench), homes(laser, bench, order))):
+                if not desk.ask(question(plan, order, bench.config, homes(laser, bench, order))):
                     raise Stopped("not cut: the operator said no")
             return _cut_now(lab, bench, order, desk, laser, log)
     finally:
@@ -167,19 +165,18 @@ def homes(laser: Laser, bench: Bench, order: CutOrder) -> bool:
 
 def _plan(laser: Laser, bench: Bench, order: CutOrder, specimen: str) -> CutPlan:
     config, identity = laser_config(bench), identity_of(laser)
-    report = laser.report()
-    will_home = homes(laser, bench, order)
-    if report.state == "Alarm" and not will_home:
-        found = Finding("CUT-LOCKED", "the board is locked: its position is not known", hint="fabctl laser home")
-        raise RefusedError("the cut cannot begin", [found])
-    affine = _affine(order, config, identity, report)
+    report, will_home = laser.report(), homes(laser, bench, order)
+    affine = affine_of(order, config, identity, report)
     lines = order.compose(specimen, identity.setting(30) or 1000.0)
-    known = will_home or (identity.is_on(22) and report.state == "Idle")
-    begin = replace(report, machine_mm=homed_mm(identity, config.travel_mm), work_mm=None) if will_home else report
+    known = will_home or is_homed(identity, report)
+    begin = after_homing(report, identity, config.travel_mm) if will_home else report
     plan = plan_cut(lines, affine, identity, begin, config, order.material, order.sheet, known)
-    if order.eye is None:
-        return plan
-    return replace(plan, findings=(*plan.findings, *_unhomed(known), *order.eye.against(plan)))
+    return replace(plan, findings=(*plan.findings, *seen_against(order.eye, plan, known)))
+
+
+def seen_against(eye: Eye | None, plan: CutPlan, known: bool) -> list[Finding]:
+    """Return what the camera has against the plan; it measures places on the machine, which homing makes `known`."""
+    return [*_unhomed(known), *eye.against(plan)] if eye is not None else []
 
 
 def _unhomed(known: bool) -> list[Finding]:
@@ -190,7 +187,8 @@ def _unhomed(known: bool) -> list[Finding]:
     return [Finding("CUT-CAMERA-UNHOMED", text, hint="fabctl laser home; a machine without homing cuts from here")]
 
 
-def _affine(order: CutOrder, config: LaserConfig, identity: Identity, report: Report) -> Affine:
+def affine_of(order: CutOrder, config: LaserConfig, identity: Identity, report: Report) -> Affine:
+    """Return the map from the sheet to the machine that the order's origin means."""
     head = report.machine_mm
     if order.eye is not None:
         return order.eye.place()
@@ -201,7 +199,8 @@ def _affine(order: CutOrder, config: LaserConfig, identity: Identity, report: Re
     return placement(order.origin, identity, config.travel_mm, config.origin_mm, head, order.camera_file)
 
 
-def _tell_findings(findings: tuple[Finding, ...], emit: Emit) -> None:
+def tell_warnings(findings: Sequence[Finding], emit: Emit) -> None:
+    """Emit every finding that does not stop the job."""
     for finding in findings:
         if finding.level != "error":
             emit(Event("finding", str(finding), data=finding.as_dict()))
@@ -212,21 +211,22 @@ def _refuse(findings: tuple[Finding, ...]) -> None:
         raise RefusedError("the cut cannot begin", errors(findings))
 
 
-def question(plan: CutPlan, order: CutOrder, config: LaserConfig, will_home: bool) -> str:
+def question(plan: CutPlan, order: CutOrder, config: BenchConfig, will_home: bool) -> str:
     """Return the one screen before the first motion."""
     preset = order.material.laser
     bounds = plan.bounds_mm() or (0.0, 0.0, 0.0, 0.0)
     focus = f", focus at {preset.focus_height_mm:g} mm" if preset is not None and preset.focus_height_mm else ""
     seen = f"  {order.eye.show(plan)}\n" if order.eye is not None else ""
     first = "homes the machine, then cuts" if will_home else "cuts from the zero you have set"
+    run_on = f"{laser_config_of(config).max_run_on_s:g} s{' of simulated time' if config.is_simulated else ''}"
     return (
         f"{order.design}\n"
         f"  {order.material.name}, {order.material.thickness_mm:g} mm: on the bed, flat, clamped{focus}?\n"
         f"  machine X {bounds[0]:.1f} to {bounds[2]:.1f}, Y {bounds[1]:.1f} to {bounds[3]:.1f} mm; "
         f"{plan.burnt_mm() / 1000:.2f} m burnt, {len(plan.lines)} lines, {minutes(plan.times.total_s)}\n"
         f"{seen}"
-        f"  {first}{', frames the job first' if order.frame else ''}; the board holds at most "
-        f"{config.max_run_on_s:g} s of work\n"
+        f"  {first}{', frames the job first' if order.frame else ''}; should this computer die, the machine "
+        f"stops within {run_on}\n"
         "  exhaust on, lid shut, glasses on, you stay beside it with the stop within reach. Start?"
     )
 
@@ -252,24 +252,23 @@ def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: L
         specimen = lab.new_specimen(order.design) if order.kind != "marks" else None
         plan = _plan(laser, bench, order, specimen.name if specimen is not None else SAMPLE_ID)
         _refuse(plan.findings)
-    run = start_run(
+    facts = {
+        "bench": bench.config.model_dump(mode="json"),
+        "material": order.material.model_dump(mode="json"),
+        **placed(order, plan),
+        "plan": summary(plan, identity_of(laser)),
+    }
+    begin = partial(
+        start_run,
         lab.runs,
         order.kind,
         specimen=specimen.name if specimen is not None else None,
         inputs=design_files(specimen.design if specimen is not None else order.design),
-        config={
-            "bench": bench.config.model_dump(mode="json"),
-            "material": order.material.model_dump(mode="json"),
-            "origin": order.origin,
-            "placement": plan.affine.rows(),
-            "work_offset_mm": list(plan.work_offset_mm),
-            "plan": summary(plan, identity_of(laser)),
-            **({"registration": order.eye.facts()} if order.eye is not None else {}),
-        },
+        config=facts,
     )
-    if order.eye is not None:
-        order.eye.record(run, plan)
-    with recorded(run, laser, log, desk, plan) as tell:
+    with recorded(begin, laser, log, desk.emit, plan) as (run, tell):
+        if order.eye is not None:
+            order.eye.record(run, plan)
         if homes(laser, bench, order):
             tell(Event("stage", "homing"))
             laser.home()
@@ -279,75 +278,13 @@ def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: L
     return CutDone(plan, specimen, run, result)
 
 
-@contextmanager
-def one_interrupt(laser: Laser) -> Iterator[None]:
-    """Let the first Ctrl-C or SIGTERM interrupt, and further ones only make `off` reset at once.
-
-    An exception in the middle of making the machine safe, or of writing down how it was left, would undo both.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    heard = False
-
-    def hear(_number: int, _frame: FrameType | None) -> None:
-        nonlocal heard
-        if heard:
-            laser.hurried = True
-            return
-        heard = True
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, hear) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
-def recorded(run: RunFolder, laser: Laser, log: WireLog, desk: Desk, plan: CutPlan) -> Iterator[Emit]:
-    """Keep the record of a run: job and wire while it runs, the outcome on every way out."""
-    write_atomically(run.artefact("job.nc"), plan.text)
-    log.write_to(run.path / "wire.log")
-    write_event = run.log_events()
-
-    def tell(event: Event) -> None:
-        if "mark" in event.data:
-            log.mark(str(event.data["mark"]), laser.clock.now_s())
-        write_event(event)
-        desk.emit(event)
-
-    with one_interrupt(laser):
-        yield from _recorded(run, laser, tell)
-
-
-def _recorded(run: RunFolder, laser: Laser, tell: Emit) -> Iterator[Emit]:
-    try:
-        yield tell
-    except (KeyboardInterrupt, StoppedByOperator) as fault:
-        run.finish("stopped", "stopped by the operator", **_left(laser))
-        raise Stopped(f"stopped; {run.run_id} says how far it came; fabctl cut run … --resume {run.run_id}") from fault
-    except FabctlError as fault:
-        run.finish("refused" if isinstance(fault, RefusedError) else "failed", str(fault), **_left(laser))
-        raise
-    except DeviceError as fault:
-        run.finish("failed", str(fault), fault=type(fault).__name__, **_left(laser))
-        raise
-    except BaseException as fault:
-        run.finish("failed", f"{type(fault).__name__}: {fault}", **_left(laser))
-        raise
-    run.finish("done")
-
-
-def _left(laser: Laser) -> dict[str, Any]:
-    """Make sure the beam is off, and return how the machine was left."""
-    left = laser.left or laser.off()
+def placed(order: CutOrder, plan: CutPlan) -> dict[str, Any]:
+    """Return where the job lies, for the run's manifest."""
     return {
-        "beam_off_confirmed": left.confirmed,
-        "position_known": left.position_known,
-        "machine_mm": list(left.machine_mm) if left.machine_mm else None,
+        "origin": order.origin,
+        "placement": plan.affine.rows(),
+        "work_offset_mm": list(plan.work_offset_mm),
+        **({"registration": order.eye.facts()} if order.eye is not None else {}),
     }
 
 

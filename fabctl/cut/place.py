@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from drivers.grbl.messages import Vector
+from drivers.grbl.messages import Report, Vector
 from drivers.grbl.settings import Identity
 from fabctl.cut.program import WORD, decimal, read_program, strip
 from fabctl.errors import UsageError
@@ -37,9 +37,30 @@ class Affine:
         x, y = point_mm
         return self.xx_ratio * x + self.xy_ratio * y + self.x_mm, self.yx_ratio * x + self.yy_ratio * y + self.y_mm
 
+    @classmethod
+    def of_rows(cls, rows: Sequence[Sequence[float]]) -> Affine:
+        """Return the map of two rows of three numbers."""
+        (a, b, c), (d, e, f) = rows
+        return cls(a, b, c, d, e, f)
+
     def rows(self) -> list[list[float]]:
         """Return the map as two rows of three numbers."""
         return [[self.xx_ratio, self.xy_ratio, self.x_mm], [self.yx_ratio, self.yy_ratio, self.y_mm]]
+
+    def of(self, inner: Affine) -> Affine:
+        """Return the map that does `inner` first, then this one."""
+        xx, yx = self.turned((inner.xx_ratio, inner.yx_ratio))
+        xy, yy = self.turned((inner.xy_ratio, inner.yy_ratio))
+        x, y = self.at((inner.x_mm, inner.y_mm))
+        return Affine(xx, xy, x, yx, yy, y)
+
+    def inverse(self) -> Affine:
+        """Return the map back from the machine to the sheet."""
+        area = self.xx_ratio * self.yy_ratio - self.xy_ratio * self.yx_ratio
+        linear = Affine(
+            self.yy_ratio / area, -self.xy_ratio / area, 0.0, -self.yx_ratio / area, self.xx_ratio / area, 0.0
+        )
+        return linear.of(Affine(x_mm=-self.x_mm, y_mm=-self.y_mm))
 
     def turned(self, vector_mm: tuple[float, float]) -> tuple[float, float]:
         """Return a difference of places, without the shift."""
@@ -70,6 +91,16 @@ def homed_mm(identity: Identity, travel_mm: tuple[float, float]) -> Vector:
     off_mm, mask = identity.setting(27) or 0.0, int(identity.setting(23) or 0)
     low_x, low_y, _, _ = travel_box_mm(identity, travel_mm)
     return low_x + off_mm if mask & 1 else -off_mm, low_y + off_mm if mask & 2 else -off_mm, 0.0
+
+
+def is_homed(identity: Identity, report: Report) -> bool:
+    """Return whether machine coordinates mean places on the machine: it can home, and is not locked."""
+    return identity.is_on(22) and report.state == "Idle"
+
+
+def after_homing(report: Report, identity: Identity, travel_mm: tuple[float, float]) -> Report:
+    """Return the report as it will be once the machine has homed."""
+    return replace(report, state="Idle", machine_mm=homed_mm(identity, travel_mm), work_mm=None)
 
 
 def placement(

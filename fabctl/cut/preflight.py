@@ -30,26 +30,31 @@ def preflight(
     identity: Identity,
     report: Report | None,
     laser: LaserConfig,
-    material: MaterialConfig,
+    material: MaterialConfig | None,
     work_offset_mm: Vector,
     sheet: Sheet | None = None,
     homed: bool = True,
 ) -> list[Finding]:
     """Return all findings against running `program` (in work coordinates) on this board with this material.
 
-    `homed` says that the machine is homed now or will be before the first move.
+    `homed` says that the machine is homed now or will be before the first move. A program run by hand, such as a frame
+    or a test grid, has no material yet, and may burn nothing.
     """
     return [
         *program.findings,
-        *_material(material, sheet),
+        *(_material(program, material, sheet) if material is not None else ()),
         *_bounds(program, identity, laser, work_offset_mm, homed),
-        *_words(program, identity, laser, material),
+        *_words(program, identity, laser),
         *_board(identity, report, laser, homed),
     ]
 
 
-def _material(material: MaterialConfig, sheet: Sheet | None) -> list[Finding]:
+def _material(program: Program, material: MaterialConfig, sheet: Sheet | None) -> list[Finding]:
     found = []
+    if not any(step.burns for step in program.steps):
+        found.append(Finding("CUT-EMPTY", "the program burns nothing"))
+    if material.laser is not None and material.laser.air_assist and not any(mode.flood for mode in program.modes):
+        found.append(Finding("CUT-AIR", "the preset wants air assist, the job never switches it on (M8)"))
     if material.danger is not None:
         found.append(
             Finding(
@@ -87,8 +92,8 @@ def _bounds(
     program: Program, identity: Identity, laser: LaserConfig, work_offset_mm: Vector, homed: bool
 ) -> list[Finding]:
     bounds = program.bounds_mm()
-    if bounds is None or not any(step.burns for step in program.steps):
-        return [Finding("CUT-EMPTY", "the program burns nothing")]
+    if bounds is None:
+        return []
     if not homed:
         return [
             Finding(
@@ -118,7 +123,7 @@ def _bounds(
     return found
 
 
-def _words(program: Program, identity: Identity, laser: LaserConfig, material: MaterialConfig) -> list[Finding]:
+def _words(program: Program, identity: Identity, laser: LaserConfig) -> list[Finding]:
     found = []
     full = identity.setting(30)
     most = max((step.s_count for step in program.steps), default=0.0)
@@ -164,8 +169,6 @@ def _words(program: Program, identity: Identity, laser: LaserConfig, material: M
         )
     if any(mode.mist for mode in program.modes) and "M" not in identity.options:
         found.append(Finding("CUT-M7", "this board has no M7", hint="switch the exhaust on by hand"))
-    if material.laser is not None and material.laser.air_assist and not any(mode.flood for mode in program.modes):
-        found.append(Finding("CUT-AIR", "the preset wants air assist, the job never switches it on (M8)"))
     return found
 
 
@@ -220,6 +223,8 @@ def _report(report: Report) -> list[Finding]:
         found.append(
             Finding("CUT-OVERRIDE", f"overrides stand at {report.overrides}, not 100 %", hint="reset the board")
         )
+    if report.state == "Alarm":
+        found.append(Finding("CUT-LOCKED", "the board is locked: its position is not known", hint="fabctl laser home"))
     if report.state in ("Door", "Sleep", "Check", "Run", "Jog", "Home", "Hold"):
         found.append(Finding("CUT-STATE", f"the board is not idle: {report.state}", hint="close the door, or reset it"))
     if set("XY") & set(report.pins):

@@ -26,10 +26,15 @@ class Trail:
     place: Place | None
 
 
+def begins(row: tuple[float, str, bytes]) -> bool:
+    """Return whether a row of `wire.log` says that the program begins here."""
+    return row[1] == MARK and row[2] == PROGRAM_BEGINS.encode("ascii")
+
+
 def read_trail(text: str, program: Program, times: Estimate, work_offset_mm: Vector) -> Trail:
     """Return the trail of `program` in the text of a `wire.log`; what came before the program began does not count."""
     rows = read_log(text)
-    starts = [k for k, row in enumerate(rows) if row[1] == MARK and row[2].decode("latin-1") == PROGRAM_BEGINS]
+    starts = [k for k, row in enumerate(rows) if begins(row)]
     if not starts:
         return Trail(False, 0, 0, None)
     listener, last = Listener(), [-1, *last_steps(program)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -15,15 +16,17 @@ import pytest
 from benchmarks._laser_kills import killed_run
 from benchmarks._laser_rig import LAB, Rig, slits
 from drivers.grbl.laser import Laser
+from drivers.transport.tap import Tap
 from fabctl.config.bench import LaserConfig
 from fabctl.config.material import LaserPreset, LayerConfig, MaterialConfig
 from fabctl.cut import job, resume
 from fabctl.cut.job import CutOrder, Desk
 from fabctl.cut.place import Affine
 from fabctl.cut.program import read_program
+from fabctl.cut.wirelog import WireLog
 from fabctl.errors import REFUSED, RefusedError, Stopped, UsageError
-from fabctl.events import silent
-from fabctl.records.folder import RunFolder, start_run
+from fabctl.events import Emit, silent
+from fabctl.records.folder import RunFolder, start_run, status_of
 from fabctl.workspace import Workspace
 
 LAYER = LayerConfig(power_frac=0.5, feed_mm_s=25.0)
@@ -37,6 +40,7 @@ BEGIN = {
     "work_offset_mm": [0.0, 0.0, 0.0],
     "placement": Affine().rows(),
     "bench": {"name": "small"},
+    "material": RUBBER.model_dump(mode="json"),
     "plan": {"job_sha256": hashlib.sha256(TEXT.encode("ascii")).hexdigest()},
 }
 
@@ -52,8 +56,8 @@ class Cut:
     bench: Any
     asked: list[str] = field(default_factory=list)
 
-    def resume(self, dry_run: bool = True) -> Any:
-        desk = Desk(lambda question: bool(self.asked.append(question)), silent)
+    def resume(self, dry_run: bool = True, yes: bool = False, emit: Emit = silent) -> Any:
+        desk = Desk(lambda question: self.asked.append(question) or yes, emit)
         return resume.resume(self.lab, self.bench, self.order, self.run.path, desk, dry_run)
 
     def refused(self) -> tuple[str, str]:
@@ -71,8 +75,14 @@ class Cut:
 
 
 @pytest.fixture
-def cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cut:
-    rig, rows, _ = killed_run(4, PROGRAM, absence_s=8.0)
+def board(request: pytest.FixtureRequest) -> Rig:
+    """Return the board that the cut begins on, with other settings where a test names them."""
+    return Rig(settings=getattr(request, "param", LAB))
+
+
+@pytest.fixture
+def cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, board: Rig) -> Cut:
+    rig, rows, _ = killed_run(4, PROGRAM, absence_s=8.0, rig=board)
     lab = Workspace(tmp_path / "lab")
     design = tmp_path / "design"
     design.mkdir()
@@ -83,12 +93,15 @@ def cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cut:
     (run.path / "wire.log").write_text("\n".join(rows) + "\n")
     run.finish("failed", "the host was killed")
     laser = LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0))
-    config = SimpleNamespace(name="small", laser=laser, model_dump=lambda **_: {"name": "small"})
+    homes = bool(board.settings[22])
+    laser = laser.model_copy(update={"homing": homes})
+    config = SimpleNamespace(name="small", laser=laser, is_simulated=False, model_dump=lambda **_: {"name": "small"})
     order = CutOrder(design, lambda _, __: PROGRAM.lines, RUBBER)
 
     @contextmanager
-    def laser_on(_bench: Any, _log: Any = None) -> Iterator[Laser]:
-        with Laser(rig.revive(), rig.clock) as laser:
+    def laser_on(_bench: Any, log: WireLog | None = None) -> Iterator[Laser]:
+        line = rig.revive()
+        with Laser(Tap(line, log.note, rig.clock) if log is not None else line, rig.clock) as laser:
             laser.connect()
             yield laser
 
@@ -159,6 +172,7 @@ def test_a_cut_that_burnt_nothing_is_begun_anew(cut: Cut) -> None:
     code, text = cut.refused()
     assert code == "RESUME-EMPTY"
     assert "before anything was cut" in text
+    assert "start it again" in text
 
 
 @pytest.mark.parametrize("status", ["done", "refused"])
@@ -182,9 +196,19 @@ def test_a_cut_is_gone_on_with_once_and_from_its_own_design(cut: Cut, tmp_path: 
     cut.order = kept
     later = start_run(cut.lab.runs, "cut", specimen="S-0001", config={"resumed": cut.run.run_id})
     later.finish("done")
+    shutil.copy(cut.run.path / "wire.log", later.path)
     code, text = cut.refused()
     assert code == "RESUME-TWICE"
     assert later.run_id in text
+
+
+def test_all_that_the_record_has_against_it_is_said_at_once(cut: Cut) -> None:
+    cut.order = replace(cut.order, material=RUBBER.model_copy(update={"name": "felt"}))
+    cut.bench.config.name = "elsewhere"
+    with pytest.raises(RefusedError) as caught:
+        cut.resume()
+    assert [finding.code for finding in caught.value.findings] == ["RESUME-BENCH", "RESUME-MATERIAL"]
+    assert "felt" in str(caught.value)
 
 
 def test_what_is_no_cut_or_not_there_is_said(cut: Cut) -> None:
@@ -261,5 +285,7 @@ def test_a_cut_without_homing_frames_first_so_that_its_zero_is_seen(
     with pytest.raises(Stopped, match="frame"):
         job.cut(cut.lab, cut.bench, cut.order, Desk(answer, silent))
     assert ["frames the job first" in asked[0], "Does it fit" in asked[1]] == [True, True]
+    (stopped,) = [run for run in cut.lab.all_runs() if run.run_id != cut.run.run_id]
+    assert status_of(stopped) == "stopped"
     assert all(point.power_frac == 0 for point in rig.trace)
     assert max(point.x_mm for point in rig.trace) - min(point.x_mm for point in rig.trace) > 20

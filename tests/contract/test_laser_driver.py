@@ -45,6 +45,21 @@ def test_connecting_asks_before_it_resets_and_sends_lines_last() -> None:
     assert sent.index(b"?") < sent.index(b"\x18") < sent.index(b"$I\n")
 
 
+@pytest.mark.parametrize("changes", [{10: 0}, {13: 1}, {10: 2, 13: 1}])
+def test_where_the_machine_is_comes_in_mm_whatever_the_board_reports(changes: dict[int, float]) -> None:
+    rig = Rig(settings={**LAB, **changes})
+    laser = connected(rig)
+    laser.ask("G10L2P1X-30Y-20")  # told in a later report, beside the place
+    laser.jog(-5, -2.5, 50.0)
+    for _ in range(40):
+        report = laser.report()
+        assert report.machine_mm == pytest.approx((-6.0, -3.5, -1.0), abs=0.003)
+    laser = connected(rig)
+    assert laser.identity is not None
+    assert laser.identity.work_offset_mm() == pytest.approx((-30.0, -20.0, 0.0), abs=0.003)
+    assert laser.off().machine_mm == pytest.approx((-6.0, -3.5, -1.0), abs=0.003)
+
+
 def test_something_that_is_no_grbl_is_said_to_be_none() -> None:
     clock = Rig().clock
 

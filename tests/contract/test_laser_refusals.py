@@ -51,7 +51,7 @@ def refusal(run: Any) -> set[str]:
 
 
 def assert_stands(rig: Rig, laser: Laser) -> None:
-    assert laser.report().machine_mm == (-1.0, -1.0, -1.0)
+    assert laser.report().machine_mm == pytest.approx((-1.0, -1.0, -1.0), abs=0.002)  # told in inches, rounded
     assert all(point.power_frac == 0 for point in rig.trace)
 
 
@@ -94,7 +94,13 @@ def test_what_passes_the_preflight_passes_the_board_s_own_soft_limits(ends: tupl
     ("expected", "settings", "lines"),
     [
         ("CUT-LASER-MODE", {32: 0}, HERE),
-        ("CUT-TRAVEL", {}, ("G21", "G90", "M4S0", "G1X90F600S{s}", "M5")),
+        ("CUT-X", {}, ("G21", "G90", "M4S0", "G1X90F600S{s}", "M5")),
+        ("CUT-INCHES", {13: 1}, HERE),
+        ("CUT-HOMING", {20: 0, 22: 0}, HERE),
+        ("CUT-RATE", {110: 500}, HERE),
+        ("CUT-S", {30: 1000}, ("G21", "G90", "M4S0", "G1X-5F600S1001", "M5")),
+        ("CUT-M3", {}, ("G21", "G90", "M3S0", "G1X-5F600S{s}", "M5")),
+        ("CUT-FORBIDDEN", {}, (*HERE, "G10L2P1X0")),
     ],
 )
 def test_by_hand_too_nothing_moves_that_could_not_end_well(
@@ -104,6 +110,37 @@ def test_by_hand_too_nothing_moves_that_could_not_end_well(
     laser = connected(rig)
     assert refusal(lambda: run_here(laser, BENCH, lines, 0.1, silent)) == {expected}
     assert_stands(rig, laser)
+
+
+@pytest.mark.parametrize("expected", ["CUT-STARTUP", "CUT-OVERRIDE", "CUT-SWITCH", "CUT-STATE"])
+def test_by_hand_too_the_board_s_own_state_is_looked_at(expected: str) -> None:
+    rig = Rig()
+    laser = connected(rig)
+    if expected == "CUT-STARTUP":
+        laser.ask("$N1=M3S9")
+        laser.connect()
+    elif expected == "CUT-OVERRIDE":
+        laser.override("feed", 120)
+        for _ in range(9):  # the next reports do not tell them
+            laser.report()
+    elif expected == "CUT-SWITCH":
+        rig.board.machine.world.switch_stuck = True
+    else:
+        laser.open_door()
+        laser.report()
+    assert refusal(lambda: run_here(laser, BENCH, HERE, 0.1, silent)) == {expected}
+    assert_stands(rig, laser)
+
+
+def test_a_board_that_tells_work_places_only_burns_from_where_the_head_is() -> None:
+    rig = Rig(settings={**LAB, 10: 0})
+    laser = connected(rig)
+    laser.ask("G10L2P1X-30Y-20")
+    laser.connect()
+    run_here(laser, BENCH, HERE, 0.1, silent)
+    lit = [point for point in rig.trace if point.power_frac > 0]
+    assert lit[0].x_mm == pytest.approx(-1.0, abs=0.1)
+    assert laser.report().machine_mm == pytest.approx((-6.0, -1.0, -1.0), abs=0.03)
 
 
 def test_a_locked_board_runs_nothing_by_hand() -> None:

@@ -94,6 +94,21 @@ def test_without_the_field_the_idle_buffer_counts_and_else_128() -> None:
     assert identify([Info("OPT", "PHS")], Report("Run", free_bytes=3)).rx_bytes == 128
 
 
+@pytest.mark.parametrize(
+    ("told", "free", "most"), [(1024, 1023, 1023), (1024, 128, 128), (128, 255, 128), (128, 3, 128)]
+)
+def test_of_two_buffer_sizes_the_smaller_one_counts(told: int, free: int, most: int) -> None:
+    for state in ("Idle", "Alarm"):
+        assert identify([Info("OPT", f"V,15,{told}")], Report(state, free_bytes=free)).rx_bytes == most
+    assert identify([Info("OPT", f"V,15,{told}")], Report("Run", free_bytes=free)).rx_bytes == told
+
+
+@pytest.mark.parametrize("text", ["error:{}", "ALARM:{}", "${}=1", "$N{}=", "<Hold:{}|FS:0,0>", "<Idle|Bf:{},1>"])
+def test_a_number_of_thousands_of_digits_is_noise(text: str) -> None:
+    (found,) = parse_line(text.format("1" * 5000))
+    assert isinstance(found, Garbled)
+
+
 def test_dialects_name_themselves() -> None:
     assert identify([Info("VER", "1.1h.20190830:")], None).firmware == "grbl"
     assert identify([Info("VER", "3.7 FluidNC v3.7.8:")], None).firmware == "FluidNC"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import select
+import socket
 
 import pytest
 
@@ -38,3 +41,38 @@ def test_what_is_no_line_is_said(url: str, said: str) -> None:
     with pytest.raises(TransportError) as caught:
         open_transport(url)
     assert said in str(caught.value)
+
+
+def test_a_serial_port_in_use_is_not_written_to() -> None:
+    master, slave = os.openpty()
+    first = open_transport(os.ttyname(slave))
+    try:
+        with pytest.raises(TransportError, match="in use"):
+            open_transport(f"serial://{os.ttyname(slave)}?baud=9600")
+        assert not select.select([master], [], [], 0)[0]
+        first.close()
+        open_transport(os.ttyname(slave)).close()
+    finally:
+        first.close()
+        os.close(master)
+        os.close(slave)
+
+
+@pytest.mark.parametrize("again", ["127.0.0.1", "localhost"])
+def test_a_device_in_use_over_tcp_is_not_even_connected_to(again: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with contextlib.closing(open_transport(f"tcp://127.0.0.1:{port}")):
+            server.accept()[0].close()
+            with pytest.raises(TransportError, match="in use"):
+                open_transport(f"tcp://{again}:{port}")
+            assert not select.select([server], [], [], 0)[0]
+        open_transport(f"tcp://{again}:{port}").close()
+
+
+def test_a_connection_that_fails_leaves_the_device_free() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+    for _ in range(2):
+        with pytest.raises(TransportError, match="refused"):
+            open_transport(url)

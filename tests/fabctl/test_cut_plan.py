@@ -76,6 +76,7 @@ REASONS: list[tuple[str, dict[str, object]]] = [
         ("CUT-STARTUP", {"board": replace(BOARD, startup=("G20", ""))}),
         ("CUT-OVERRIDE", {"report": replace(IDLE, overrides=(120, 100, 100))}),
         ("CUT-STATE", {"report": Report("Door", 1)}),
+        ("CUT-LOCKED", {"report": replace(IDLE, state="Alarm")}),
         ("CUT-SWITCH", {"report": replace(IDLE, pins="X")}),
         ("CUT-DOOR", {"report": replace(IDLE, pins="D")}),
         ("CUT-M3", {"lines": tuple(line.replace("M4", "M3") for line in GOOD)}),
@@ -169,6 +170,13 @@ def test_a_laid_program_burns_where_the_map_puts_it(
         x, y = affine.at(a[k].end_mm)
         assert math.dist(b[k].end_mm, (x - offset[0], y - offset[1])) < 0.002
     assert sum(step.length_mm for step in b) == pytest.approx(sum(step.length_mm for step in a), abs=0.02)
+
+
+def test_maps_are_done_one_after_the_other_and_undone() -> None:
+    a, b = Affine(0.8, -0.6, 3.0, 0.6, 0.8, -2.0), Affine(1.01, 0.02, -7.0, -0.03, 0.99, 11.0)
+    assert a.of(b).at((4.0, 9.0)) == pytest.approx(a.at(b.at((4.0, 9.0))))
+    assert b.inverse().at(b.at((4.0, 9.0))) == pytest.approx((4.0, 9.0))
+    assert Affine.of_rows(b.rows()) == b
 
 
 def test_a_camera_map_must_be_rigid(tmp_path: Path) -> None:

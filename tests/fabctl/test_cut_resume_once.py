@@ -10,6 +10,8 @@ from fabctl.cut.resume import against_resuming
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Specimen, Workspace
 
+BEGUN = '{"t_s": 1.0, "dir": ">", "bytes": "?"}\n{"t_s": 2.0, "dir": "#", "bytes": "program begins"}\n'
+
 
 @pytest.fixture
 def cut(tmp_path: Path) -> tuple[Workspace, Specimen, RunFolder]:
@@ -37,14 +39,23 @@ def test_a_second_resume_is_refused_however_the_first_ended(
 ) -> None:
     lab, specimen, run = cut
     later = start_run(lab.runs, "cut", specimen=specimen.name, config={"resumed": run.run_id})
+    (later.path / "wire.log").write_text(BEGUN)
     if status is not None:
         later.finish(status)
     assert codes(lab, run, specimen, specimen.design) == ["RESUME-TWICE"]
 
 
-def test_a_resume_that_was_refused_counts_for_nothing(cut: tuple[Workspace, Specimen, RunFolder]) -> None:
+@pytest.mark.parametrize("status", ["refused", "stopped", "failed", None])
+@pytest.mark.parametrize("log", [None, "", '{"t_s": 1.0, "dir": ">", "bytes": "(program begins)\\n"}\n{"t_s": 2'])
+def test_a_resume_whose_program_never_began_counts_for_nothing(
+    cut: tuple[Workspace, Specimen, RunFolder], status: str | None, log: str | None
+) -> None:
     lab, specimen, run = cut
-    start_run(lab.runs, "cut", specimen=specimen.name, config={"resumed": run.run_id}).finish("refused")
+    later = start_run(lab.runs, "cut", specimen=specimen.name, config={"resumed": run.run_id})
+    if log is not None:
+        (later.path / "wire.log").write_text(log)
+    if status is not None:
+        later.finish(status)
     assert codes(lab, run, specimen, specimen.design) == []
 
 
