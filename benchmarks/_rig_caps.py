@@ -117,8 +117,9 @@ def shipped(quick: bool) -> list[Figure]:
 def _measured(name: str, way: Way, seeds: int) -> list[Figure]:
     from joblib import Parallel, delayed
 
+    first = int(os.environ.get("RIG_FIRST_SEED", "0"))
     pressed = Parallel(n_jobs=int(os.environ.get("RIG_JOBS", "2")), batch_size=20)(
-        delayed(press_cap)(loads, N * seed + k + offset, way)
+        delayed(press_cap)(loads, N * (first + seed) + k + offset, way)
         for loads, offset in ((LOW_N, 0), (HIGH_N, 10_000_000))
         for seed in range(seeds)
         for k in range(N)

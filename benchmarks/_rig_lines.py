@@ -11,7 +11,8 @@ from typing import Any
 
 from drivers.errors import DeviceRefused, ProtocolError
 from drivers.rig.bus import open_bus
-from drivers.rig.indenter import LOST, Indenter, Limits, MotionUnknown, RigFaulted
+from drivers.rig.indenter import LOST, Indenter, Limits
+from drivers.rig.refusals import MotionUnknown, RigFaulted
 from fabctl.config.rig import load_rig
 from simulators.rig import registers as R
 from simulators.rig.controller import Controller, Machine

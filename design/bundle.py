@@ -65,6 +65,10 @@ class Bundle:
     def drawing(self, sheet: int | None = None) -> Drawing:
         """Return what is to be cut; of a design that is split over sheets, the whole or `sheet`, from 1."""
         name = "paths.json" if sheet is None else f"paths-{sheet}.json"
+        if sheet is not None and name not in self.manifest["files"]:
+            count = sum(file.startswith("paths-") for file in self.manifest["files"])
+            have = f"is split over {count} sheets" if count else "is one sheet: leave the number of a sheet out"
+            raise BundleError(f"{self.path}: there is no sheet {sheet}; this {self.kind} {have}")
         return from_json(json.loads(self.file(name).read_text(encoding="utf-8")))
 
     def cells(self) -> list[dict[str, str]]:
@@ -159,7 +163,9 @@ def _write_whole(path: Path, replace: bool, about: Mapping[str, Any], fill: Call
 def refuse_taken(path: Path, replace: bool = False) -> None:
     """Raise `BundleError` where no design may be written into the folder; for asking before a long build."""
     if path.exists() and not _may_replace(path, replace):
-        raise BundleError(f"{path}: exists already; choose another folder, or say that a design there may be replaced")
+        raise BundleError(
+            f"{path}: exists already; choose another folder, or say that a design there may be replaced (--replace)"
+        )
 
 
 def _may_replace(path: Path, replace: bool) -> bool:

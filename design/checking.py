@@ -64,10 +64,11 @@ def check(
     found = list(report.findings)
     design = None
     if report.best() is not None:
-        watch("laying out the sheet", 0.7)
         try:
             asked = replace(spec, response=None, infeasible=cast(Any, "report" if remedy == "none" else remedy))
-            design = build(asked, mesh, library, presets)
+            design = build(
+                asked, mesh, library, presets, lambda text, done: watch(f"the sheet: {text}", 0.6 + 0.4 * done)
+            )
             found += [finding for finding in design.findings if finding not in found]
         except DesignError as fault:
             found.append(Finding("CHECK-SHEET", fault.message, "error"))

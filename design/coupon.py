@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,8 +35,17 @@ LINE_MM, BETWEEN_MM = 2.6, 1.4  # height of the tag's two lines of text, and wha
 COLUMNS_COUNT = 3  # patches side by side
 PATCHES_LIMIT_COUNT = 26  # letters
 CELLS = ("cell", "cx_mm", "cy_mm", "inverted", "t_mm", "theta_deg", "expansion_ratio", "hinge_mm", "kind")
+COUPON_CELLS = (*CELLS, "patch")
 FORM = ("patch", "hinge_mm", "expected_expansion_ratio", "flat_length_mm", "measured_length_mm", "cycles_count",
         "failed_at")  # fmt: skip
+FORM_HEAD = (
+    "# A line a patch. preview.png shows the two notches of a patch to measure between: A1 and A2 of patch A.",
+    "# hinge_mm and expected_expansion_ratio are for you to read: the tool takes them from cells.csv by the patch",
+    "# flat_length_mm: from notch 1 to notch 2 before opening. As drawn; write over it what you measured.",
+    "# measured_length_mm: the same opened and let go; several readings parted by spaces",
+    "# cycles_count: how often it was opened and closed. failed_at: the cycle at which a hinge tore; empty if none did",
+    "# then: fabctl design coupon-read with the specimen's id or this file where it lies",
+)
 
 BORDER = BorderOptions()
 
@@ -49,6 +58,15 @@ class Patch:
     hinge_mm: float
     expansion_ratio: float | None  # None where the finite elements say that it is not bistable
     gauge_mm: float  # from a notch of its left border to the one across, flat
+    notches_mm: Array  # (2, 2) these two places on the sheet
+
+
+@dataclass(frozen=True, slots=True)
+class PatchAsCut:
+    """What the cells of a coupon's folder say of one patch."""
+
+    hinge_mm: float
+    expansion_ratio: float | None  # None where the finite elements say that it is not bistable
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +87,12 @@ def coupon(
     sheet: Sheet,
     cells_count: tuple[int, int] = (6, 6),
     border: BorderOptions = BORDER,
+    watch: Callable[[str, float], None] = lambda _message, _done_frac: None,
 ) -> Coupon:
     """Return a sheet of uniform patches, one a hinge width, and what each should do when it is pulled open.
 
-    Each patch is `cells_count` edges wide and rows high. Every hinge is solved by finite elements, not looked up.
+    Each patch is `cells_count` edges wide and rows high. Every hinge is solved by finite elements, not looked up;
+    `watch` hears which, and how much is done.
     Raises `DesignError` where a hinge leaves no slit.
     """
     _check(hinges_mm, t_mm, theta_rad, sheet)
@@ -92,9 +112,16 @@ def coupon(
             anchors.append(Anchor(x, y - half, LINE_MM, anchor.width_mm))
     paths += registration_marks(size, border) if border.marks else []
     first = anchors[0] if anchors else None
-    solved = [solve_cell(t_mm, theta_rad, replace(sheet, hinge_mm=hinge)).expansion_ratio for hinge in hinges_mm]
+    solved = []
+    for k, hinge in enumerate(hinges_mm):
+        watch(f"solving a cell with hinges of {hinge:g} mm", k / len(hinges_mm))
+        solved.append(solve_cell(t_mm, theta_rad, replace(sheet, hinge_mm=hinge)).expansion_ratio)
+    watch("writing the folder", 1.0)
     gauge_mm = sheet.edge_mm * cells_count[0]
-    patches = [Patch(n, h, s, gauge_mm) for n, h, s in zip(names, hinges_mm, solved, strict=True)]
+    patches = [
+        Patch(name, hinge, expansion, gauge_mm, _notches_mm(tiling, gauge_mm))
+        for name, hinge, expansion, tiling in zip(names, hinges_mm, solved, tilings, strict=True)
+    ]
     drawing = Drawing(size, tuple(paths), first, None, tuple(anchors[1:]))
     return Coupon(t_mm, theta_rad, drawing, tuple(patches), tuple(tilings))
 
@@ -143,6 +170,18 @@ def _patch(
     return joined, anchor, paths, tiling
 
 
+def _notches_mm(tiling: Tiling, gauge_mm: float) -> Array:
+    """Return the notches at both ends of the narrow row of corners nearest to the patch's middle."""
+    corners = tiling.vertices_mm
+    levels = np.unique(corners[:, 1].round(6))
+    ends = []
+    for level in levels[1:-1]:
+        row = corners[np.isclose(corners[:, 1], level)]
+        ends.append(row[[row[:, 0].argmin(), row[:, 0].argmax()]])
+    narrow = [pair for pair in ends if math.isclose(pair[1, 0] - pair[0, 0], gauge_mm, abs_tol=1e-6)]
+    return min(narrow, key=lambda pair: abs(float(pair[0, 1]) - float(levels.mean())))
+
+
 def _places(bounds: Sequence[tuple[float, ...]], margin_mm: float) -> tuple[list[Array], tuple[float, float]]:
     """Return by how much each piece is moved, three in a row, and the sheet's size."""
     width = max(high_x - low_x for low_x, _, high_x, _ in bounds) + GAP_MM
@@ -157,7 +196,7 @@ def _places(bounds: Sequence[tuple[float, ...]], margin_mm: float) -> tuple[list
 
 def coupon_csv(patches: Sequence[Patch]) -> str:
     """Return a form to fill in at the table: measured length and cycles beside what is expected."""
-    lines = [",".join(FORM)]
+    lines = [*FORM_HEAD, ",".join(FORM)]
     for patch in patches:
         expected = "" if patch.expansion_ratio is None else f"{patch.expansion_ratio:.4f}"
         lines.append(f"{patch.label.split()[0]},{patch.hinge_mm:.4f},{expected},{patch.gauge_mm:.3f},,,")
@@ -168,15 +207,25 @@ def coupon_cells_csv(made: Coupon) -> str:
     """Return one row a cell, as a design's `cells.csv`; a patch that springs back counts as monostable."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(CELLS)
+    rows.writerow(COUPON_CELLS)
     number = 0
     for patch, tiling in zip(made.patches, made.tilings, strict=True):
         kind = "cut" if patch.expansion_ratio is not None else "monostable"
         values = made.t_mm, math.degrees(made.theta_rad), patch.expansion_ratio or 1.0, patch.hinge_mm
         for (x, y), inverted in zip(tiling.centres_mm().tolist(), tiling.inverted.tolist(), strict=True):
-            rows.writerow((number, f"{x:.6f}", f"{y:.6f}", int(inverted), *(f"{v:.6f}" for v in values), kind))
+            place, letter = (f"{x:.6f}", f"{y:.6f}", int(inverted)), patch.label.split()[0]
+            rows.writerow((number, *place, *(f"{v:.6f}" for v in values), kind, letter))
             number += 1
     return text.getvalue()
+
+
+def patches_as_cut(cells: Sequence[Mapping[str, str]]) -> dict[str, PatchAsCut]:
+    """Return the patches by their letters from the rows of a coupon's `cells.csv`."""
+    found = {}
+    for row in cells:
+        expansion = float(row["expansion_ratio"]) if row["kind"] == "cut" else None
+        found[row["patch"]] = PatchAsCut(float(row["hinge_mm"]), expansion)
+    return found
 
 
 def coupon_facts(made: Coupon, job: Job, edge_mm: float) -> dict[str, Any]:

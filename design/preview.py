@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from design.coupon import Coupon
+from design.coupon import Coupon, Patch
 from design.export.svg import COLOURS
 from design.pattern.drawing import Drawing
 from design.pattern.paths import LAYERS, CutPath
 from design.pattern.tiling import Array
 from design.pipeline import Design
 
-WIDTH_INCHES, DPI = 10.0, 150
+WIDTH_INCHES, DPI = 7.5, 200  # a report shows it at half a page: letters must stay legible
 TICKS_COUNT = 5  # intervals along the longest axis of a picture in space
 
 
@@ -50,8 +50,21 @@ def coupon_png(made: Coupon) -> bytes:
     counts = [len(tiling.cells) for tiling in made.tilings]
     expansion = np.repeat([patch.expansion_ratio or 1.0 for patch in made.patches], counts)
     title = f"coupon: {len(made.patches)} patches on {width:.0f} × {height:.0f} mm"
-    _draw_sheet(figure, figure.add_subplot(), made.drawing, corners, expansion, title)
+    axes = figure.add_subplot()
+    _draw_sheet(figure, axes, made.drawing, corners, expansion, title)
+    for patch in made.patches:
+        _draw_gauge(axes, patch)
+    axes.set_xlabel("x, mm\nmeasure each patch from notch 1 to notch 2, flat and opened; write it into coupon.csv")
     return _png(figure)
+
+
+def _draw_gauge(axes: Any, patch: Patch) -> None:
+    """Draw the length to measure, from one notch to the one across, both named."""
+    axes.plot(*patch.notches_mm.T, "o--", color="#b3261e", linewidth=1.2, markersize=5)
+    for number, ((x, y), side) in enumerate(zip(patch.notches_mm.tolist(), ("right", "left"), strict=True), start=1):
+        away = -4 if side == "right" else 4
+        axes.annotate(f"{patch.label.split()[0]}{number}", (x, y), (away, 0), textcoords="offset points", ha=side,
+                      va="center", color="#b3261e", fontsize=9, weight="bold")  # fmt: skip
 
 
 def _png(figure: Any) -> bytes:

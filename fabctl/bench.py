@@ -19,9 +19,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from design.findings import Finding
 from fabctl.config.bench import BenchConfig
 from fabctl.errors import BenchBusy, RefusedError, UsageError
-from fabctl.records.folder import person, write_atomically
+from fabctl.records.folder import RunFolder, person, write_atomically
 from fabctl.workspace import Workspace
 
 READY = "ready:"
@@ -157,8 +158,6 @@ def deployment_checklist(config: BenchConfig, specimen: str) -> tuple[str, ...]:
 
 def refuse_without(config: BenchConfig, *devices: str) -> None:
     """Raise `RefusedError` naming every device of `devices` that the bench lacks."""
-    from design.findings import Finding
-
     missing = [
         Finding("BENCH-DEVICE", f"no {name} in the bench file", where=config.name, hint=f"add a {name}: section")
         for name in devices
@@ -166,6 +165,15 @@ def refuse_without(config: BenchConfig, *devices: str) -> None:
     ]
     if missing:
         raise RefusedError(f"bench {config.name} cannot do this job", missing)
+
+
+def begun_elsewhere(before: RunFolder, bench: BenchConfig) -> list[Finding]:
+    """Return what speaks against going on with a run on this bench: that it was begun on another one."""
+    there = (before.manifest().get("config", {}).get("bench") or {}).get("name")
+    if there in (None, bench.name):
+        return []
+    text = f"{before.run_id} was begun on bench {there}, this is {bench.name}"
+    return [Finding("RESUME-BENCH", text, hint=f"go on there: --bench {there}")]
 
 
 def remember(state: Path, found: dict[str, dict[str, Any]]) -> None:

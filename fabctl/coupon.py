@@ -6,20 +6,22 @@ import csv
 import json
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from design.bundle import open_bundle
-from design.coupon import FORM
+from design.bundle import Bundle, open_bundle
+from design.coupon import FORM, PatchAsCut, patches_as_cut
+from design.errors import NoBundle
 from design.findings import Finding
 from fabctl.errors import RefusedError, UnreadableInput
 from fabctl.files import text_of
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Workspace
 
+KIND = "coupon-read"  # of the run
 FORM_ROUNDING = 6e-5  # the form is printed with four decimals
 COVERAGE = 2.0  # the uncertainty given is about 95 %
 LOW_RATIO, HIGH_RATIO = 0.9, 2.2  # a length outside that is a slip of the pen: no cell expands so
@@ -38,32 +40,55 @@ class Measured:
     cycles_count: int
     failed_at_count: int | None  # the cycle at which a hinge tore; None where none did
 
-    def off_ratio(self) -> float | None:
-        """Return measured less expected; None where the patch was expected to spring back."""
-        return None if self.expected_ratio is None else self.expansion_ratio - self.expected_ratio
+    def off_ratio(self) -> float:
+        """Return measured less expected, which is the flat's own length where the patch should spring back."""
+        return self.expansion_ratio - (1.0 if self.expected_ratio is None else self.expected_ratio)
 
-    def agrees(self) -> bool | None:
+    def agrees(self) -> bool:
         """Say whether the map lies within the uncertainty."""
-        off = self.off_ratio()
-        return None if off is None else abs(off) <= self.uncertainty_ratio
+        return abs(self.off_ratio()) <= self.uncertainty_ratio
 
 
-def read_form(path: Path, length_error_mm: float) -> list[Measured]:
+def open_coupon(folder: Path) -> dict[str, PatchAsCut]:
+    """Return what was cut, from the `cells.csv` of a coupon's folder; raise `RefusedError` where it is none."""
+    try:
+        found = open_bundle(folder)
+    except NoBundle as fault:
+        hint = "leave it in the coupon's folder, or say whose it is with --specimen"
+        told = Finding("COUPON-ALONE", "holds no coupon, so what was cut is not known", where=str(folder), hint=hint)
+        raise UnreadableInput("the form cannot be read there", [told]) from fault
+    if found.kind != "coupon":
+        told = Finding("COUPON-SPECIMEN", "was cut from a design, not from a coupon", where=str(folder))
+        raise RefusedError("a coupon's form cannot be read there", [told])
+    return _as_cut(found)
+
+
+def _as_cut(found: Bundle) -> dict[str, PatchAsCut]:
+    try:
+        return patches_as_cut(found.cells())
+    except (KeyError, ValueError) as fault:
+        told = Finding("COUPON-CELLS", "says of no cell which patch it is in", where=str(found.path / "cells.csv"))
+        raise UnreadableInput("an older coupon; make it again", [told]) from fault
+
+
+def read_form(path: Path, length_error_mm: float, cut: Mapping[str, PatchAsCut]) -> list[Measured]:
     """Return the patches of a filled form; raise `RefusedError` with everything that is missing or cannot be.
 
-    Several readings of one length stand in its field parted by spaces or semicolons. `length_error_mm` is the standard
-    error of one reading of the rule or calliper; it counts once for a patch, the scatter of readings beside it.
+    Hinges and expected expansions are those of `cut`; a form that says others is another coupon's. Several readings of
+    one length stand in its field parted by spaces or semicolons. `length_error_mm` is the standard error of one reading
+    of the rule or calliper; it counts once for a patch, the scatter of readings beside it.
     """
-    text = text_of(path, "a coupon's form")
-    rows = list(csv.DictReader(text.splitlines()))
+    lines = text_of(path, "a coupon's form").splitlines()
+    head = next((k for k, line in enumerate(lines) if not line.lstrip('"').startswith("#")), len(lines))
+    rows = list(csv.DictReader(lines[head:]))
     names = rows[0].keys() if rows else ()
     missing = [name for name in FORM if name not in names]
     if missing:
         text = f"has no column {', '.join(missing)}" if rows else "has no rows"
         raise UnreadableInput("not a coupon's form", [Finding("COUPON-FORM", text, where=str(path))])
     found: list[Finding] = []
-    patches = [_patch(row, f"{path}:{line}", length_error_mm, found) for line, row in enumerate(rows, start=2)]
-    names_seen = [row["patch"] for row in rows]
+    patches = [_patch(row, f"{path}:{k}", length_error_mm, cut, found) for k, row in enumerate(rows, start=head + 2)]
+    names_seen = [_word(row, "patch") for row in rows]
     for name in sorted({name for name in names_seen if names_seen.count(name) > 1}):
         found.append(Finding("COUPON-TWICE", f"patch {name} stands there twice", where=str(path)))
     if found:
@@ -71,8 +96,17 @@ def read_form(path: Path, length_error_mm: float) -> list[Measured]:
     return [patch for patch in patches if patch is not None]
 
 
-def _patch(row: dict[str, str], where: str, length_error_mm: float, found: list[Finding]) -> Measured | None:
+def _patch(
+    row: dict[str, str], where: str, length_error_mm: float, cut: Mapping[str, PatchAsCut], found: list[Finding]
+) -> Measured | None:
     before = len(found)
+    name = _word(row, "patch")
+    mine = cut.get(name)
+    if mine is None:
+        text = f"patch {name or '?'} was not cut; the coupon has {', '.join(cut)}"
+        found.append(Finding("COUPON-OTHER", text, where=where))
+    else:
+        found += [Finding("COUPON-OTHER", text, where=where) for text in _unlike(name, row, mine)]
 
     def number(name: str, text: str) -> float:
         try:
@@ -85,12 +119,11 @@ def _patch(row: dict[str, str], where: str, length_error_mm: float, found: list[
             return math.nan
         return value
 
-    flat, hinge = number("flat_length_mm", _word(row, "flat_length_mm")), number("hinge_mm", _word(row, "hinge_mm"))
+    flat = number("flat_length_mm", _word(row, "flat_length_mm"))
     words = _word(row, "measured_length_mm").replace(";", " ").split() or [""]
     lengths = [number("measured_length_mm", word) for word in words]
     cycles = _count("cycles_count", _word(row, "cycles_count"), where, found, needed=True)
     failed = _count("failed_at", _word(row, "failed_at"), where, found, needed=False)
-    expected = number("expected_expansion_ratio", text) if (text := _word(row, "expected_expansion_ratio")) else None
     if failed is not None and cycles is not None and failed > cycles:
         text = f"failed at cycle {failed}, but only {cycles} were made"
         found.append(Finding("COUPON-CYCLES", text, where=where))
@@ -98,12 +131,29 @@ def _patch(row: dict[str, str], where: str, length_error_mm: float, found: list[
         if math.isfinite(length) and math.isfinite(flat) and not LOW_RATIO < length / flat < HIGH_RATIO:
             text = f"{length:g} mm from {flat:g} mm flat is no expansion that a cell can have"
             found.append(Finding("COUPON-LENGTH", text, where=where))
-    if len(found) > before or cycles is None:
+    if len(found) > before or cycles is None or mine is None:
         return None
     ratios = [length / flat for length in lengths]
     scatter = stdev(ratios) / math.sqrt(len(ratios)) if len(ratios) > 1 else 0.0
     uncertainty = COVERAGE * math.hypot(length_error_mm / flat, scatter)
-    return Measured(_word(row, "patch"), hinge, expected, fmean(ratios), uncertainty, len(ratios), cycles, failed)
+    expected = mine.expansion_ratio
+    return Measured(name, mine.hinge_mm, expected, fmean(ratios), uncertainty, len(ratios), cycles, failed)
+
+
+def _unlike(name: str, row: dict[str, str], mine: PatchAsCut) -> list[str]:
+    """Return what the form says of a patch and the coupon as cut does not; what was left empty says nothing."""
+    found = []
+    pairs = (("hinge_mm", mine.hinge_mm, " mm"), ("expected_expansion_ratio", mine.expansion_ratio, ""))
+    for column, value, unit in pairs:
+        text = _word(row, column)
+        known = "none" if value is None else f"{value:.4f}{unit}"
+        try:
+            same = not text or (value is not None and abs(float(text) - value) <= FORM_ROUNDING)
+        except ValueError:
+            same = False
+        if not same:
+            found.append(f"patch {name}: {column} is {text} in the form, {known} as cut: the form of another coupon?")
+    return found
 
 
 def _word(row: dict[str, str], name: str) -> str:
@@ -135,36 +185,20 @@ def write_measured(form: Path, patches: list[Measured], length_error_mm: float) 
 
 
 def keep_result(
-    lab: Workspace, specimen: str, form: Path, patches: list[Measured], length_error_mm: float
+    lab: Workspace, specimen: str, form: Path, patches: list[Measured], length_error_mm: float, cut: Iterable[str]
 ) -> RunFolder:
-    """Write a run of kind `coupon` with the form and what it says; raise `RefusedError` where it is another's form."""
-    design = open_bundle(lab.specimen(specimen).design)
-    if design.kind != "coupon":
-        told = Finding("COUPON-SPECIMEN", "was cut from a design, not from a coupon", where=specimen)
-        raise RefusedError("the form cannot be this specimen's", [told])
-    cut = {row["patch"]: row for row in design.manifest["facts"]["patches"]}
-    found = [text for patch in patches if (text := _unlike(patch, cut.get(patch.patch)))]
-    if found:
-        raise RefusedError(
-            f"the form is not that of {specimen}", [Finding("COUPON-OTHER", text, where=str(form)) for text in found]
-        )
-    run = start_run(lab.runs, "coupon", specimen=specimen, inputs=[form], config={"length_error_mm": length_error_mm})
+    """Write a run of kind `coupon-read` with the form and what it says; `cut` are the letters of all patches."""
+    run = start_run(lab.runs, KIND, specimen=specimen, inputs=[form], config={"length_error_mm": length_error_mm})
     shutil.copyfile(form, run.artefact("coupon.csv"))
-    missing = sorted(cut.keys() - {patch.patch for patch in patches})
+    missing = sorted(set(cut) - {patch.patch for patch in patches})
     run.write_result({"patches": as_rows(patches), "missing": missing})
-    run.finish("done", f"{len(patches)} patches read")
+    run.finish("done", sentence(patches))
     return run
 
 
-def _unlike(patch: Measured, cut: Mapping[str, Any] | None) -> str:
-    """Return what a form's patch has that the coupon as cut has not; nothing where they are the same."""
-    if cut is None:
-        return f"patch {patch.patch} was not cut"
-    if abs(patch.hinge_mm - cut["hinge_mm"]) > FORM_ROUNDING:
-        return f"patch {patch.patch}: its hinge is {patch.hinge_mm:g} mm, cut with {cut['hinge_mm']:g} mm"
-    expected = cut["expected_expansion_ratio"]
-    if (expected is None) != (patch.expected_ratio is None) or (
-        expected is not None and abs((patch.expected_ratio or 0.0) - expected) > FORM_ROUNDING
-    ):
-        return f"patch {patch.patch}: expected to expand by {patch.expected_ratio}, the coupon says {expected}"
-    return ""
+def sentence(patches: Sequence[Measured]) -> str:
+    """Return in a line whether the map holds on the patches that were measured."""
+    off = [patch.patch for patch in patches if not patch.agrees()]
+    if off:
+        return f"{len(off)} of {len(patches)} patches off the map by more than their uncertainty: {', '.join(off)}"
+    return f"{len(patches)} patches measured, all within their uncertainty of the map"

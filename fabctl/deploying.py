@@ -55,6 +55,9 @@ class Laid:
 def read_laid(folder: Path, home: Path) -> Laid:
     """Return the shell of a design folder; raise `BundleError`, or `RefusedError` where it was built without one."""
     bundle = open_bundle(folder)
+    if bundle.kind == "coupon":
+        told = Finding("DEPLOY-COUPON", "is a coupon: flat patches that are pulled open by hand", where=str(folder))
+        raise RefusedError("nothing to deploy", [told])
     if "deployed.ply" not in bundle.manifest["files"]:
         missing = Finding("DEPLOY-NONE", "was built without a prediction", where=str(folder), hint="set `response`")
         raise RefusedError("nothing to deploy", [missing])
@@ -167,19 +170,30 @@ def _goal_mm(layout: Layout, paper: TriMesh, target: TriMesh) -> Reals:
     return lift(flat, paper.vertices_mm[:, :2], paper.faces, target.vertices_mm, target.faces)
 
 
-def picture_png(mesh: TriMesh, target: TriMesh, title: str) -> bytes:
-    """Return a picture of a deployed sheet, coloured by its distance from the target."""
-    from design.deploy.compare import closest
+def farthest_mm(mesh: TriMesh, target: TriMesh) -> Reals:
+    """Return for every unit the distance of its farthest sample from the target, `(m,)`."""
+    from design.deploy.compare import closest, surface_samples
 
-    distance = closest(mesh.vertices_mm[mesh.faces].mean(axis=1), target)[0]
+    away: Reals = closest(surface_samples(mesh.vertices_mm, mesh.faces)[0], target)[0]
+    farthest: Reals = away.reshape(-1, 4).max(axis=1)
+    return farthest
+
+
+def picture_png(mesh: TriMesh, target: TriMesh, title: str) -> bytes:
+    """Return a picture of a deployed sheet, each unit coloured by how far its farthest sample is from the target.
+
+    The samples are those of `Deviation`, so that the bar ends at its `max_mm`.
+    """
+    distance = farthest_mm(mesh, target)
     figure, axes, faces = _stage(mesh, title)
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
 
     scale = ScalarMappable(cmap=colormaps["viridis"])
     scale.set_array(distance)
+    scale.set_clim(0.0, float(distance.max()))
     faces.set_facecolor(scale.to_rgba(distance))
-    figure.colorbar(scale, ax=axes, shrink=0.6, label="distance from the target, mm")
+    figure.colorbar(scale, ax=axes, shrink=0.6, label="farthest of each unit from the target, mm")
     out = io.BytesIO()
     figure.savefig(out, dpi=110, format="png")
     return out.getvalue()
@@ -217,5 +231,5 @@ def _stage(mesh: TriMesh, title: str):  # type: ignore[no-untyped-def]  # matplo
         getattr(axes, f"set_{name}lim")(middle[k] - reach, middle[k] + reach)
         getattr(axes, f"set_{name}label")(f"{name}, mm")
     few_ticks(axes)
-    axes.set_title(title)
+    axes.set_title(title, fontsize=10)
     return figure, axes, faces

@@ -127,6 +127,9 @@ def inputs_for(
         return read_inputs(target, home, None, cell_mm, library)
     if is_spec and target not in TARGETS:
         raise UsageError(f"{target}: a specification says its material and cells itself; change them there")
+    if target not in TARGETS and not Path(target).exists():
+        known = ", ".join(sorted({*TARGETS, *names("specs", home)}))
+        raise UsageError(f"{target}: no such file, nor the name of a surface or a specification (known: {known})")
     source: str | MadeTarget = MadeTarget(make=target) if target in TARGETS else target
     config = SpecConfig(
         name=re.sub(r"\W", "-", Path(target).stem) or "target",
@@ -251,15 +254,22 @@ def presets_of(material: MaterialConfig) -> dict[Layer, LayerPreset]:
     return {layer: LayerPreset(c.power_frac, c.feed_mm_s, c.passes_count) for layer, c in layers.items()}
 
 
-def write_coupon(folder: Path, asked: CouponConfig, home: Path, replace: bool = False) -> tuple[Coupon, Bundle]:
+def write_coupon(
+    folder: Path, asked: CouponConfig, home: Path, replace: bool = False, emit: Emit = silent
+) -> tuple[Coupon, Bundle]:
     """Write a coupon's folder, which is cut as a design's is; return what is drawn, and the folder."""
+    refuse_taken(folder, replace)
     material = load_material(asked.material, home)
     presets = presets_of(material)
     assert material.laser is not None
     sheet = sheet_of(material, material.edge_mm)
     library = load_library(Path(asked.library) if asked.library else None).scaled(sheet)
     cell = select(library, np.array([asked.expansion_ratio]))
-    made = coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), asked.hinges_mm, sheet)
+
+    def watch(message: str, done_frac: float) -> None:
+        emit(Event("progress", message, done_frac))
+
+    made = coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), asked.hinges_mm, sheet, watch=watch)
     job = compose_job(made.drawing, presets, job_options(asked.tool, material.laser.kerf_mm), remarks=[asked.name])
     text = yaml.safe_dump(asked.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
     return made, write_coupon_bundle(made, job, text, library.hash, sheet.edge_mm, folder, replace)

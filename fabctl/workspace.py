@@ -43,18 +43,21 @@ class Workspace:
         path.mkdir(parents=True, exist_ok=True)
         return path
 
+    def next_id(self) -> str:
+        """Return the id that the next specimen will have, if nobody else is given it first."""
+        names = [p.name for p in self.specimens.iterdir()] if self.specimens.is_dir() else []
+        return f"S-{max((int(name[2:]) for name in names if SPECIMEN.fullmatch(name)), default=0) + 1:04d}"
+
     def new_specimen(self, design: Path) -> Specimen:
         """Give out the next id, with a copy of the design (a folder, or one file); safe against two cuts at once."""
         self.specimens.mkdir(parents=True, exist_ok=True)
-        taken = [int(p.name[2:]) for p in self.specimens.iterdir() if SPECIMEN.fullmatch(p.name)]
-        number = max(taken, default=0) + 1
         while True:
-            path = self.specimens / f"S-{number:04d}"
+            path = self.specimens / self.next_id()
             try:
                 path.mkdir()
                 break
             except FileExistsError:
-                number += 1
+                continue
         try:
             if design.is_dir():
                 shutil.copytree(design, path / "design")
@@ -83,7 +86,10 @@ class Workspace:
         if "/" in name or (direct / "manifest.json").is_file():
             if not (direct / "manifest.json").is_file():
                 raise UsageError(f"{name}: no run lies there; `fabctl run list` names them")
-            return open_run(direct)
+            try:
+                return open_run(direct)
+            except RecordError as fault:
+                raise UsageError(f"{fault}; `fabctl run list` names the runs") from fault
         folders = [p for p in self.runs.iterdir() if p.is_dir()] if self.runs.is_dir() else []
         matches = [p for p in folders if p.name == name] or [
             p for p in folders if name and _begins_or_ends(p.name, name)
@@ -129,6 +135,12 @@ class Specimen:
     def design(self) -> Path:
         """Return the specimen's own copy of the design folder."""
         return self.path / "design"
+
+    @property
+    def is_coupon(self) -> bool:
+        """Tell whether it is a coupon: flat patches to be pulled open by hand, no surface to press."""
+        manifest = self.design / "manifest.json"
+        return manifest.is_file() and json.loads(manifest.read_text(encoding="utf-8")).get("kind") == "coupon"
 
     def record(self) -> dict[str, Any]:
         """Return what is written about the specimen."""

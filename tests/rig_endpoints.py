@@ -28,6 +28,20 @@ PATIENT = replace(REFERENCE, timeout_s=0.4, response_max_s=0.1)
 ENDPOINTS = ("sim-tcp", "sim-rtu", "libmodbus-tcp", "libmodbus-rtu", "modbus_tk-tcp", "modbus_tk-rtu")
 
 
+def short_method(*steps: str, name: str = "short", watchdog_s: float = 1.0) -> str:
+    """Return the file of a method that presses with at most 4 N: a tare, then `steps`, each as in the file."""
+    head = f"name: {name}\nsample_hz: 100\nsafe_height_mm: 0.5\ntravel_speed_mm_s: 20\nacceleration_mm_s2: 200\n"
+    limits = f"limits: {{force_N: 4, tension_N: 1, travel_mm: 40, watchdog_s: {watchdog_s}}}\nsteps:\n"
+    return head + limits + "".join(f"  - {{{step}}}\n" for step in ("step: tare, time_s: 0.3", *steps))
+
+
+def rig_bench(url: str, name: str = "short", registers: str = "reference", slot: str = "") -> str:
+    """Return the file of a bench with nothing but the rig at `url`."""
+    size = "travel_mm: 60, force_limit_N: 20, indenter_radius_mm: 8"
+    lines = [f"name: {name}", f'rig: {{url: "{url}", map: {registers}, {size}}}']
+    return "\n".join([*lines, *([f'specimen_slot: "{slot}"'] if slot else [])]) + "\n"
+
+
 @contextlib.contextmanager
 def simulated_rig(*words: str, cwd: Path = ROOT) -> Iterator[str]:
     """Run the simulator with `words`; yield its URL."""

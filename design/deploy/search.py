@@ -97,13 +97,20 @@ def hinted(layout: Layout, x_mm: Reals, hints: Sequence[tuple[float, float, floa
 
     Places count from the middle of the flat's box, as a specification's regions do; each means the bump nearest to it,
     and +1 the side that units run counter-clockwise to. One after the other, each from the rest before it. Where there
-    is no bump, `ValueError`; a bump that does not stay on its side shows in the shape and its energy.
+    is no bump, or a place is beside the sheet, `ValueError`; a bump that does not stay on its side shows in the shape
+    and its energy.
     """
     places, centre = bumps(layout), layout.corners_mm.mean(axis=1)
     if not places:
         raise ValueError("the sheet has no bump that could stand to either side")
     middle = 0.5 * (layout.corners_mm.min(axis=(0, 1)) + layout.corners_mm.max(axis=(0, 1)))
+    half = 0.5 * (layout.corners_mm.max(axis=(0, 1)) - layout.corners_mm.min(axis=(0, 1)))
     for x, y, side in hints:
+        if abs(x) > half[0] or abs(y) > half[1]:
+            raise ValueError(
+                f"({x:g}, {y:g}) mm lies beside the sheet, whose cells reach {half[0]:.0f} mm to the left and right of "
+                f"their middle and {half[1]:.0f} mm up and down"
+            )
         away = np.linalg.norm(centre - middle - [x, y], axis=1)
         bump = min(places, key=lambda group: float(away[group].min()))
         rest = solve_level(layout, turned_over(layout, x_mm, bump, side))

@@ -13,40 +13,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout, ProtocolError, TransportError
+from drivers.errors import DeviceRefused, DeviceTimeout, ProtocolError, TransportError
 from drivers.rig.bus import ExceptionReply, RegisterBus, open_bus
+from drivers.rig.plausible import MapDoubted, doubt_identity, doubt_status
+from drivers.rig.refusals import MotionUnknown, RigFaulted, refused
 from drivers.rig.registers import BadReply, RegisterMap, Value
 from drivers.rig.samples import Asked, Freshness, Restarted, Sample, Stale
 
 LOST = (DeviceTimeout, BadReply, ExceptionReply)  # one reply less; the next request may do better
+LOOK_S = 0.02  # between two readings that show whether the sequence runs
+THERE_MM, THERE_RATIO = 0.1, 0.005  # a motion that is done ends as near to its target
 Guard = Literal["none", "above", "below"]
 T = TypeVar("T")
-
-
-class RigFaulted(DeviceError):
-    """The controller stopped the stage by itself; the fault stays latched until it is cleared."""
-
-    def __init__(self, faults: tuple[str, ...], position_mm: float, force_N: float) -> None:
-        super().__init__(faults, position_mm, force_N)
-        self.faults, self.position_mm, self.force_N = faults, position_mm, force_N
-
-    def __str__(self) -> str:
-        return (
-            f"rig: the controller stopped the stage: {', '.join(self.faults) or 'fault'} at {self.position_mm:.3f} mm, "
-            f"{self.force_N:.3f} N gross; look at the specimen, then `fabctl rig clear` and `fabctl rig retract`"
-        )
-
-
-class MotionUnknown(DeviceError):
-    """A motion command was sent and its arrival could not be confirmed. The stage was told to stop."""
-
-    def __init__(self, command: str, number: int, stopped: bool) -> None:
-        super().__init__(command, number, stopped)
-        self.command, self.number, self.stopped = command, number, stopped
-
-    def __str__(self) -> str:
-        after = "the stage was stopped" if self.stopped else "the stage did NOT confirm the stop: press the e-stop"
-        return f"rig: whether {self.command} (command {self.number}) was executed is not known; {after}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +69,7 @@ class Indenter:
         self._request = 0
         self._number = 0
         self._asked_s = -1.0
+        self._sent_to = (0, 0.0, False)  # number, target and whether a force may end the newest motion before it
         self.lost_count = 0
 
     @property
@@ -102,13 +81,15 @@ class Indenter:
 
     def identify(self) -> Identity:
         """Return who answers; raise `ProtocolError` where it is not what the register map describes."""
-        values = self._again(lambda: self._read("identity"))
+        words = self._again(lambda: self._words("identity"))
+        values = self.registers.decode("identity", words)
         if values["magic"] != self.registers.magic or values["version"] != self.registers.version:
             raise ProtocolError(
                 f"{self.bus.url}: says {values['magic']:#06x} version {values['version']}, the map "
                 f"{self.registers.name!r} describes {self.registers.magic:#06x} version {self.registers.version}; "
-                "choose the right map in the bench file, or check the unit id"
+                "choose the right map in the bench file (rig.map), or check the unit id"
             )
+        doubt_identity(self.registers, words)
         firmware = int(values["firmware"])
         return Identity(
             model=str(values["model"]),
@@ -118,6 +99,17 @@ class Indenter:
             travel_mm=float(values["travel"]),
             speed_max_mm_s=float(values["speed_max"]),
         )
+
+    def look(self, identity: Identity) -> None:
+        """Raise `MapDoubted` where the status is nothing this rig can mean; neither feeds the watchdog nor moves."""
+        first = self._again(lambda: self._words("status"))
+        began_s = self._now_s()
+        self._sleep(LOOK_S)
+        second = self._again(lambda: self._words("status"))
+        whole = all(self.registers.is_whole(words) for words in (first, second))
+        if whole:  # else the line garbles, which the reading of samples tells better
+            apart_s = self._now_s() - began_s
+            doubt_status(self.registers, (first, second), apart_s, identity.capacity_N, identity.travel_mm)
 
     def environment(self) -> dict[str, float]:
         """Return temperature, humidity and the stage's place, as far as the rig has them."""
@@ -213,7 +205,9 @@ class Indenter:
         With `guard` the controller stops the stage where the gross force is above (below) `until_N`.
         """
         command = {"none": "move", "above": "move_until_above", "below": "move_until_below"}[guard]
-        return self._confirmed(command, target=target_mm, speed=speed_mm_s, until=until_N)
+        number = self._confirmed(command, target=target_mm, speed=speed_mm_s, until=until_N)
+        self._sent_to = (number, target_mm, guard != "none")
+        return number
 
     def move_stage(self, x_mm: float, y_mm: float, speed_mm_s: float) -> int:
         """Begin to move the specimen sideways; the controller allows it only above the safe height."""
@@ -236,12 +230,41 @@ class Indenter:
                 return True  # a controller that was restarted is disarmed
         return False
 
+    def ended(self, sample: Sample, number: int) -> bool:
+        """Tell whether command `number` is over; raise where the controller stopped it, or it ended elsewhere."""
+        if sample.state == "faulted":
+            raise RigFaulted(sample.faults, sample.position_mm, sample.force_N)
+        if sample.command_id != number:
+            why = f"command {sample.command_id} took its place"
+            raise DeviceRefused("rig", f"command {number}", why, "one host only")
+        if sample.command_state == "aborted":
+            raise DeviceRefused("rig", f"command {number}", f"stopped: {sample.reason}")
+        if sample.command_state == "done":
+            self._doubt_the_place(sample)
+        return sample.command_state == "done"
+
+    def _doubt_the_place(self, sample: Sample) -> None:
+        """Raise where a motion is done at another place than it was sent to: position and target count differently."""
+        number, target_mm, guarded = self._sent_to
+        if (
+            sample.command_id != number
+            or sample.state == "moving"
+            or (guarded and sample.reason != "limit_not_reached")
+        ):
+            return
+        if abs(sample.position_mm - target_mm) > THERE_MM + THERE_RATIO * abs(target_mm):
+            raise MapDoubted(
+                f"{self.bus.url}: the stage was sent to {target_mm:.3f} mm and says it is done at "
+                f"{sample.position_mm:.3f} mm; in map {self.registers.name!r} the scales of status.position and "
+                "command.target contradict each other"
+            )
+
     def wait(self, number: int, patience_s: float) -> Sample:
         """Sample until command `number` has ended; return the last sample. Raise where it ended in a fault."""
         until_s = self._now_s() + patience_s
         while True:
             found = self.fresh_sample()
-            if ended(found, number):
+            if self.ended(found, number):
                 return found
             if self._now_s() > until_s:
                 raise DeviceTimeout(self.bus.url, f"the end of command {number}", patience_s)
@@ -309,7 +332,7 @@ class Indenter:
             if found is not None or self._now_s() > until_s:
                 return False
         if found.command_state == "refused":
-            raise DeviceRefused("rig", f"{command} {_spoken(values)}".strip(), found.reason, _hint(found.reason))
+            raise refused(command, values, found.reason)
         if values:
             self._compare(command, number, values)
         return True
@@ -341,9 +364,12 @@ class Indenter:
                 return True
         return False
 
-    def _read(self, name: str) -> dict[str, Value]:
+    def _words(self, name: str) -> list[int]:
         block = self.registers.blocks[name]
-        return self.registers.decode(name, self.bus.read(block.table, block.address, block.words_count))
+        return self.bus.read(block.table, block.address, block.words_count)
+
+    def _read(self, name: str) -> dict[str, Value]:
+        return self.registers.decode(name, self._words(name))
 
     def _again(self, ask: Callable[[], T]) -> T:
         """Ask up to five times; only for what may be asked twice."""
@@ -355,39 +381,13 @@ class Indenter:
         return ask()
 
 
-def ended(sample: Sample, number: int) -> bool:
-    """Tell whether command `number` is over; raise where the controller stopped it by itself."""
-    if sample.state == "faulted":
-        raise RigFaulted(sample.faults, sample.position_mm, sample.force_N)
-    if sample.command_id != number:
-        raise DeviceRefused("rig", f"command {number}", f"command {sample.command_id} took its place", "one host only")
-    if sample.command_state == "aborted":
-        raise DeviceRefused("rig", f"command {number}", f"stopped: {sample.reason}")
-    return sample.command_state == "done"
-
-
 def open_indenter(url: str, registers: RegisterMap, hear: Callable[[Sample], None] = lambda _: None) -> Indenter:
     """Open the rig behind `url` and make sure that it is what `registers` describes."""
     bus = open_bus(url, registers.timeout_s, registers.response_max_s)
     rig = Indenter(bus, registers, hear)
     try:
-        rig.identify()
+        rig.look(rig.identify())
     except BaseException:  # Ctrl-C too: the line is given back
         bus.close()
         raise
     return rig
-
-
-def _spoken(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} {value:g}" for name, value in values.items())
-
-
-def _hint(reason: str) -> str:
-    return {
-        "not_armed": "arm first",
-        "faulted": "see `fabctl rig info`, remove the cause, then `fabctl rig clear`",
-        "not_homed": "fabctl rig home",
-        "outside_travel": "choose a target inside the limits",
-        "not_at_safe_height": "retract first",
-        "id_not_newer": "another host commands this rig",
-    }.get(reason, "")

@@ -109,6 +109,10 @@ class RegisterMap:
             start = end
         return found
 
+    def is_whole(self, words: Sequence[int]) -> bool:
+        """Tell whether a status block fits the check at its end, where the map has one."""
+        return self.blocks["status"].registers[-1].name != "check" or words[-1] == check_word(words[:-1])
+
     def encode(self, block: str, values: Mapping[str, Value]) -> list[int]:
         """Return the words of the whole block; every value of it must be given."""
         words: list[int] = []

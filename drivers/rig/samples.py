@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drivers.rig.registers import BadReply, RegisterMap, check_word
+from drivers.rig.registers import BadReply, RegisterMap
 
 HEARTBEAT_MODULUS = 2**16
 SLACK_S = 0.02  # two clocks of 100 ppm and the time of a frame on the line, with room
@@ -89,7 +89,7 @@ class Freshness:
     def believe(self, words: Sequence[int], asked: Asked) -> Sample:
         """Return the sample, or raise `BadReply` with the reason."""
         values = self._map.decode("status", words)
-        if "check" in values and values["check"] != check_word(words[:-1]):
+        if not self._map.is_whole(words):
             raise BadReply(f"status: the block's check {values['check']} does not fit its words")
         if "request_echo" in values and values["request_echo"] != asked.request:
             raise Stale(f"status: answers request {values['request_echo']}, asked was {asked.request}: stale")

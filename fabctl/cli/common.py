@@ -116,6 +116,8 @@ def progress() -> Emit:
             elif int(event.done_frac * 10) != tenth[0]:
                 click.echo(text, err=True)
             tenth[0] = int(event.done_frac * 10)
+        elif event.kind == "progress" and live:  # how far is not known, only that it goes on
+            click.echo(f"{ERASE_TO_END}        {event.message}\r", err=True, nl=False)
         elif event.kind in ("stage", "state", "warning", "finding"):
             say(event.message)
 

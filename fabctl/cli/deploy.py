@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from fabctl.cli.common import PLACE_MM, json_option, lab, progress, show
 from fabctl.cli.paths import InFolder, OutFolder
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from design.spec import Rim
     from fabctl.deploying import Laid
     from fabctl.events import Emit
+
+GIVEN = (ParameterSource.COMMANDLINE, ParameterSource.ENVIRONMENT)
 
 
 @click.command()
@@ -78,7 +81,9 @@ def command(
 
     if by_unit and parts > 1:
         raise click.UsageError("--cascade opens whole units: leave --parts out")
+    _refuse_unused(gravity, support)
     emit = progress()
+    emit(Event("stage", f"reading {design}"))
     laid = read_laid(design, lab().root)
     laid = divided(laid, parts) if parts > 1 else laid
     emit(Event("stage", f"deploying {len(laid.layout.cells)} units"))
@@ -88,7 +93,7 @@ def command(
         emit(Event("stage", f"its weight acts; rim: {support}"))
         settled = settle(laid.layout, popped.mesh.vertices_mm, laid.sheet, support, friction, not level_floor)
     folder = output or design.with_name(design.name + "-deployed")
-    facts = {**_facts(popped, parts), **_softest(laid, popped.equilibrium), **_sag(settled, support)}
+    facts = {**_facts(popped, parts), **_softest(laid, popped.equilibrium), **_sag(settled, support, laid)}
     if shapes:
         facts["shapes"] = _shapes(laid, shapes, emit)
     if compensate:
@@ -97,8 +102,20 @@ def command(
     if by_unit:
         facts["cascade"] = _cascade(laid, folder, popped, animation, emit)
     facts["folder"] = str(folder)
+    emit(Event("stage", f"drawing {'picture and animation' if animation else 'the picture'} into {folder}"))
     _write(folder, laid, popped, settled, animation, facts)
     show(facts, as_json, _lines(facts))
+
+
+def _refuse_unused(gravity: bool, support: Rim) -> None:
+    """Raise `click.UsageError` where an option was given that another one takes all effect from."""
+    ctx = click.get_current_context()
+    given = [name for name in ("support", "friction", "level_floor") if ctx.get_parameter_source(name) in GIVEN]
+    words = [f"--{name.replace('_', '-')}" for name in given]
+    if words and not gravity:
+        raise click.UsageError(f"{', '.join(words)} says how the sheet bears its weight: give --gravity too")
+    if "friction" in given and support != "coulomb":
+        raise click.UsageError(f"--friction is that of --support coulomb, and this rim is {support}")
 
 
 def _from_hints(laid: Laid, hints: tuple[tuple[float, float, str], ...]) -> Deployed:
@@ -139,10 +156,15 @@ def _softest(laid: Laid, rest: Equilibrium) -> dict[str, Any]:
     return {"smallest_eigenvalue_N_mm": smallest_eigenvalue_N_mm(system, rest.x_mm, (), None)}
 
 
-def _sag(settled: Settled | None, support: str) -> dict[str, Any]:
+def _sag(settled: Settled | None, support: str, laid: Laid) -> dict[str, Any]:
+    from design.deploy.compare import deviation
+
     if settled is None:
         return {}
+    off = deviation(settled.equilibrium.x_mm, laid.layout.cells, laid.target)  # where it stands, not aligned anew
     return {
+        "loaded_deviation_mean_mm": off.mean_mm,
+        "loaded_deviation_max_mm": off.max_mm,
         "support": support,
         "weight_N": settled.weight_N,
         "sag_mm": settled.sag_mm,
@@ -244,7 +266,9 @@ def _write(
     folder.mkdir(parents=True, exist_ok=True)
     shown = popped.mesh if settled is None else TriMesh(settled.equilibrium.x_mm, popped.mesh.faces)
     write_ply(folder / "deployed.ply", shown)
-    title = "deployed" if settled is None else f"deployed, under its weight ({facts['support']})"
+    key, title = ("", "deployed") if settled is None else ("loaded_", f"under its weight, rim {facts['support']}")
+    title += f": {facts[f'{key}deviation_mean_mm']:.2f} mm from the target on average, "
+    title += f"{facts[f'{key}deviation_max_mm']:.2f} mm at most"
     write_atomically(folder / "deployed.png", picture_png(shown, laid.target, title))
     if animation:
         frames = deployment(laid.layout, popped.mesh.vertices_mm)
@@ -261,9 +285,11 @@ def _lines(facts: dict[str, Any]) -> list[str]:
         f"after {facts['iterations_count']} iterations",
     ]
     if "sag_mm" in facts:
+        off_mm, most_mm = facts["loaded_deviation_mean_mm"], facts["loaded_deviation_max_mm"]
         lines.append(
             f"weight {facts['weight_N']:.3f} N, rim {facts['support']}: sags {facts['sag_mm']:.2f} mm at the top, "
-            f"slides {facts['slid_mm']:.2f} mm; {'stable' if facts['loaded_stable'] else 'not stable'} "
+            f"slides {facts['slid_mm']:.2f} mm; as it stands {off_mm:.2f} mm from the target on average, "
+            f"{most_mm:.2f} mm at most; {'stable' if facts['loaded_stable'] else 'not stable'} "
             f"(smallest eigenvalue {facts['loaded_smallest_eigenvalue_N_mm']:.1e} N/mm)"
         )
     for shape in facts.get("shapes", []):

@@ -9,6 +9,7 @@ import click
 
 from fabctl.cli.common import MATERIAL, json_option, lab, progress, say, show
 from fabctl.cli.design_coupon import coupon, coupon_read, library_option
+from fabctl.cli.library_parts import CURVE_WHY
 from fabctl.cli.paths import TARGET, InFile, InFolder, OutFolder, PictureFile, config_names
 from fabctl.events import Event
 
@@ -57,7 +58,7 @@ def build(
         f"{bundle.path}: {numbers['cells_count']} cells on {width:.0f} × {height:.0f} mm",
         f"expansion {numbers['expansion_low_ratio']:.3f} to {numbers['expansion_high_ratio']:.3f}",
         f"cut {numbers['cut_mm'] / 1000:.2f} m, travel {numbers['travel_mm'] / 1000:.2f} m, "
-        f"about {numbers['cut_time_s'] / 60:.1f} min",
+        f"about {numbers['cut_time_s'] / 60:.1f} min without the specimen's id",
     ]
     if "deviation_mean_mm" in numbers:
         lines.append(
@@ -103,6 +104,7 @@ def check(
     from fabctl.records.folder import write_atomically
 
     listen = progress()
+    listen(Event("stage", f"reading {target} and the library of cells"))
     inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
 
     def watch(message: str, done_frac: float) -> None:
@@ -116,6 +118,9 @@ def check(
         say(str(finding))
     low, high = found.report.limits.low_ratio, found.report.limits.high_ratio
     lines = [f"{found.topology}; the library has {low:.3f} to {high:.3f}, a spread of {high / low:.3f}"]
+    least, greatest = inputs.library.range_ratio()
+    if (f"{least:.3f}", f"{greatest:.3f}") != (f"{low:.3f}", f"{high:.3f}"):
+        lines[0] += f" (all its cells {least:.3f} to {greatest:.3f}: {CURVE_WHY})"
     for step in found.report.steps:
         lines.append(
             f"{step.rung:8} spread {step.spread_ratio:.3f}  {'fits' if step.fits else 'too much'}: {step.detail}"
@@ -126,7 +131,9 @@ def check(
         width, height = found.design.drawing.size_mm
         minutes = found.design.job.time_s / 60
         count = len(found.design.cells.wanted_ratio)
-        lines.append(f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut")
+        lines.append(
+            f"the sheet: {count} cells on {width:.0f} × {height:.0f} mm, about {minutes:.1f} min to cut, without its id"
+        )
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
     facts = {"target": target, "fits": fits, **found.as_dict()}
@@ -142,6 +149,7 @@ def compare(a: Path, b: Path, as_json: bool) -> None:
     from design.bundle import open_bundle
     from design.compared import compare as compared
 
+    say(f"reading {a} and {b}")
     found = compared(open_bundle(a), open_bundle(b))
     lines = [f"{'':24} {a.name:>14} {b.name:>14}   B over A"]
     for name, ratio in found["b_over_a_ratio"].items():

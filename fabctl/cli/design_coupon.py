@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import MATERIAL, json_option, lab, show
+from fabctl.cli.common import MATERIAL, json_option, lab, progress, show
 from fabctl.cli.finite import numbers
 from fabctl.cli.paths import SPECIMEN, SPECIMEN_OR_FILE, InFile, OutFolder
+from fabctl.errors import DONE, OUT_OF_TOLERANCE
 
 if TYPE_CHECKING:
     from fabctl.coupon import Measured
@@ -51,7 +52,7 @@ def coupon(
         raise click.UsageError("--hinges-mm takes widths from 0.01 to 10 mm")
     chosen_from = None if library is None else str(library.resolve())
     asked = CouponConfig(material=material, expansion_ratio=expansion_ratio, hinges_mm=hinges, library=chosen_from)
-    made, bundle = write_coupon(output, asked, lab().root, replace)
+    made, bundle = write_coupon(output, asked, lab().root, replace, progress())
     width, height = made.drawing.size_mm
     lines = [f"{output}: {len(made.patches)} patches on {width:.0f} × {height:.0f} mm"]
     for patch in made.patches:
@@ -72,10 +73,12 @@ def coupon(
 def coupon_read(form: str, length_error_mm: float, specimen: str | None, as_json: bool) -> None:
     """Read a coupon's filled FORM: measured expansions and open-close cycles against the map.
 
-    FORM is coupon.csv, its folder, or a specimen that was cut as a coupon (S-0001: the form in its own folder). What
-    is known of a specimen goes into its record and its report.
+    FORM is coupon.csv in its folder, that folder, or a specimen that was cut as a coupon (S-0001: the form in its own
+    folder). Hinges and expected expansions come from the folder's cells.csv, not from the form. What is known of a
+    specimen goes into its record and its report. Exit code 6 where a patch is off the map by more than its
+    uncertainty.
     """
-    from fabctl.coupon import as_rows, keep_result, read_form, write_measured
+    from fabctl.coupon import as_rows, keep_result, open_coupon, read_form, sentence, write_measured
     from fabctl.workspace import SPECIMEN
 
     if specimen is None and SPECIMEN.fullmatch(form) and not Path(form).exists():
@@ -84,24 +87,23 @@ def coupon_read(form: str, length_error_mm: float, specimen: str | None, as_json
     else:
         path = Path(form)
     path = path / "coupon.csv" if path.is_dir() else path
-    patches = read_form(path, length_error_mm)
+    cut = open_coupon(path.parent if specimen is None else lab().specimen(specimen).design)
+    patches = read_form(path, length_error_mm, cut)
     data: dict[str, Any] = {"patches": as_rows(patches)}
     if specimen is not None:
-        data |= {"specimen": specimen, "run": keep_result(lab(), specimen, path, patches, length_error_mm).run_id}
+        run = keep_result(lab(), specimen, path, patches, length_error_mm, cut)
+        data |= {"specimen": specimen, "run": run.run_id}
     data["file"] = str(write_measured(path, patches, length_error_mm))
-    show(data, as_json, _read_lines(patches))
+    code = DONE if all(patch.agrees() for patch in patches) else OUT_OF_TOLERANCE
+    show(data, as_json, [*_read_lines(patches), sentence(patches)], code, sentence(patches))
 
 
 def _read_lines(patches: Sequence[Measured]) -> Iterator[str]:
     yield f"{'patch':6}{'hinge, mm':>10}{'expected':>10}{'measured':>10}{'± 95 %':>9}{'off':>9}  cycles"
     for patch in patches:
-        expected, off = patch.expected_ratio, patch.off_ratio()
-        told = f"{expected:10.4f}" if expected is not None else f"{'none':>10}"
-        away = f"{off:+9.4f}" if off is not None else f"{'':>9}"
+        told = f"{patch.expected_ratio or 1.0:10.4f}"
         ended = f", torn at {patch.failed_at_count}" if patch.failed_at_count is not None else ""
         yield (
             f"{patch.patch:6}{patch.hinge_mm:10.3f}{told}{patch.expansion_ratio:10.4f}{patch.uncertainty_ratio:9.4f}"
-            f"{away}  {patch.cycles_count}{ended}"
+            f"{patch.off_ratio():+9.4f}  {patch.cycles_count}{ended}"
         )
-    outside = [patch.patch for patch in patches if patch.agrees() is False]
-    yield f"outside their uncertainty: {', '.join(outside)}" if outside else "all agree with the map"

@@ -1,4 +1,7 @@
-"""What is checked of a command line before anything else: numbers are finite (click's ranges let `nan` through)."""
+"""What is checked of a command line before anything else, which click itself lets through.
+
+Numbers are finite, and an option that takes one value is given once: of two the last would count, unsaid.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +36,30 @@ def floats(value: Any) -> list[float]:
     return [value] if isinstance(value, float) else []
 
 
+@dataclass(frozen=True)
+class Once:
+    """A command's way to read its words, which refuses an option that is given twice."""
+
+    command: click.Command
+    then: Callable[[click.Context, list[str]], list[str]]
+
+    def __call__(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Return the words that are left; raise `click.UsageError` where an option stands there twice."""
+        words = args[: args.index("--")] if "--" in args else list(args)
+        for param in self.command.params:
+            if isinstance(param, click.Option) and not param.multiple and not param.is_flag:
+                given = [word for word in words if word.split("=", 1)[0] in param.opts]
+                if len(given) > 1:
+                    raise click.UsageError(
+                        f"{given[0].split('=', 1)[0]} is given {len(given)} times; give it once", ctx
+                    )
+        return self.then(ctx, args)
+
+
 def finite(command: click.Command) -> click.Command:
-    """Return `command` with all its parameters, and those of its subcommands, held to finite numbers."""
+    """Return `command` and its subcommands with all that is checked here."""
+    if not isinstance(command, click.Group) and not isinstance(command.parse_args, Once):
+        command.parse_args = Once(command, command.parse_args)  # type: ignore[method-assign]
     for param in command.params:
         if not isinstance(param.callback, FiniteOnly):
             param.callback = FiniteOnly(param.callback)

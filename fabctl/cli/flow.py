@@ -88,7 +88,7 @@ def command(
     data = {"specimen": flow.specimen, "design": flow.design, **flow.steps}
     data |= {"verdict": report["verdict"], "sentence": report["sentence"], "report": report["report"]}
     code = OUT_OF_TOLERANCE if flow.out_of_tolerance else DONE
-    lines = [f"{flow.specimen}: {report['sentence']}", f"report: {report['report']}"]
+    lines = [f"{flow.specimen}: {report['sentence']}", f"design: {flow.design}", f"report: {report['report']}"]
     show(data, as_json, lines, code, report["sentence"])
 
 
@@ -96,6 +96,6 @@ def _wait_for_a_person(flow: Flow, order: Order, as_json: bool) -> None:
     assert flow.specimen is not None
     lines = deployment_checklist(order.bench, flow.specimen)
     data = {"specimen": flow.specimen, "design": flow.design, **flow.steps, "next": list(lines)}
-    show(data, as_json, [f"{flow.specimen} is cut. Now by hand:", *lines])
+    show(data, as_json, [f"{flow.specimen} is cut (design: {flow.design}). Now by hand:", *lines])
     if as_json:
         say(f"{flow.specimen} is cut. By hand now: {lines[-1]}")

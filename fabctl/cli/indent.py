@@ -116,11 +116,11 @@ def analyse_command(runs: tuple[str, ...], groups: tuple[str, ...], output: Path
     named = parse_groups(lab(), runs, groups)
     if not named:
         raise UsageError("name at least one run, specimen or --group")
-    body = analyse_groups(named, output)
+    body = analyse_groups(named, output, progress())
     lines = []
     for name, found in body["groups"].items():
-        lines.append(f"{name}: {len(found['runs'])} runs")
         one = len(found["runs"]) == 1
+        lines.append(f"{name}: 1 run" if one else f"{name}: {len(found['runs'])} runs")
         lines += list(_lines(found["runs"][0]["result"])) if one else [_short(each) for each in found["runs"]]
         if found.get("stiffness_secant_N_mm") is not None:
             spread = found["stiffness_secant_N_mm"]
@@ -168,9 +168,9 @@ def _screen(plan: IndentPlan, bench: str) -> Iterator[str]:
     peak = plan.predicted_peak_N
     yield f"  predicted peak {peak:.2f} N" if peak is not None else "  no predicted response"
     count = len({(a.point, a.curve) for a in plan.actions if a.curve})
-    yield f"  {count} curves, about {plan.time_s:.0f} s, {plan.sample_hz:g} samples a second"
-    if plan.resumes:
-        yield f"  goes on with {plan.resumes}"
+    yield f"  {count} curve{'s' * (count != 1)}, about {plan.time_s:.0f} s, {plan.sample_hz:g} samples a second"
+    if plan.resumed is not None:
+        yield f"  goes on with {plan.resumed.run_id}"
     for finding in plan.findings:
         yield f"  {finding}"
 

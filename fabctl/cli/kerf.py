@@ -95,7 +95,7 @@ def cut_coupon(folder: Path, origin: str, dry_run: bool, bench_name: str, yes: b
         strokes = [*text_strokes(specimen, anchor), *code_strokes(specimen, box, spot_mm)]
         return coupon_gcode(made, presets_of(stuff)["engrave"], spot_mm, GcodeOptions(s_max_count=s_max_count), strokes)
 
-    order = CutOrder(file, compose, stuff, origin=origin, kind="kerf")  # type: ignore[arg-type]  # click.Choice has checked it
+    order = CutOrder(file, compose, stuff, origin=origin, kind="kerf-coupon")  # type: ignore[arg-type]  # click.Choice has checked it
     done = plain_job(order, bench_name, f"coupon {folder.name}", yes, dry_run)
     facts = {"coupon": str(file), "specimen": None, "run": None, **done.result}
     if done.run is None or done.specimen is None:

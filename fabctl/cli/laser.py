@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -190,18 +190,19 @@ def frame(width_mm: float, height_mm: float, power_frac: float, bench_name: str,
     from fabctl.cut.program import decimal
 
     size = (f"X{decimal(width_mm)}Y0", f"X{decimal(width_mm)}Y{decimal(height_mm)}", f"X0Y{decimal(height_mm)}", "X0Y0")
+    question = f"Go around {width_mm:g} × {height_mm:g} mm at {power_frac:.0%} power?"
     with _laser(bench_name, "framing") as (laser, bench):
-        if not confirm(f"Go around {width_mm:g} × {height_mm:g} mm at {power_frac:.0%} power?", yes):
-            raise click.Abort
-        report = _go_around(laser, bench, size, power_frac)
+        report = _go_around(laser, bench, size, power_frac, lambda: confirm(question, yes))
     show(_facts(report), as_json, [_place(report)])
 
 
-def _go_around(laser: Laser, bench: Bench, corners: tuple[str, ...], power_frac: float) -> Report:
+def _go_around(
+    laser: Laser, bench: Bench, corners: tuple[str, ...], power_frac: float, ask: Callable[[], bool]
+) -> Report:
     from fabctl.cut.by_hand import run_here
 
     lines = ["G21", "G90", "G94", "M4S0" if power_frac else "M5", "G0X0Y0", f"G1{corners[0]}F3000S{{s}}", *corners[1:]]
-    run_here(laser, bench, [*lines, "M5", "G4P0.01"], power_frac, progress())
+    run_here(laser, bench, [*lines, "M5", "G4P0.01"], power_frac, progress(), ask)
     return laser.report()
 
 
@@ -245,9 +246,8 @@ def testgrid(
     from fabctl.cut.by_hand import run_here
     from fabctl.cut.job import identity_of
 
+    question = f"Cut a grid of {width:g} × {height:g} mm here, exhaust on, you beside it?"
     with _laser(bench_name, "test grid") as (laser, bench):
         lines = grid_lines(grid, identity_of(laser).setting(30) or 1000.0)
-        if not confirm(f"Cut a grid of {width:g} × {height:g} mm here, exhaust on, you beside it?", yes):
-            raise click.Abort
-        time_s = run_here(laser, bench, lines, 0.0, progress())
+        time_s = run_here(laser, bench, lines, 0.0, progress(), lambda: confirm(question, yes))
     show({**facts, "actual_s": time_s}, as_json, [f"cut in {time_s:.0f} s"])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from fabctl.cli.common import json_option, progress, show
+from fabctl.cli.common import json_option, progress, say, show
 from fabctl.cli.library_build import build
 from fabctl.cli.library_parts import (
     file_option,
@@ -74,6 +74,7 @@ def plot(file: Path | None, t_mm: float | None, theta_deg: float | None, output:
     library = load_library(file)
     if (t_mm is None) != (theta_deg is None):
         raise click.UsageError("give both --t-mm and --theta-deg, or neither")
+    say(f"drawing {output}" if t_mm is None else f"solving the cell and its stretch, for {output}")
     if t_mm is None or theta_deg is None:
         pictures.save(pictures.maps(library), output)
     else:
@@ -109,17 +110,18 @@ def cell_command(t_mm: float, theta_deg: float, material: str, output: Path | No
     from design.cells.geometry import cell_slits
     from design.cells.homogenise import Failure, solve_cell
     from design.cells.states import cell_states
-    from fabctl.errors import REFUSED
+    from fabctl.errors import DONE, REFUSED
     from fabctl.reports import cells as pictures
 
     sheet, theta = sheet_named(material), math.radians(theta_deg)
+    say("solving the cell")
     cell = solve_cell(t_mm, theta, sheet)
     numbers = _numbers(cell, sheet)
     numbers["slits_mm"] = None if cell.verdict == "invalid" else cell_slits(t_mm, theta, sheet).tolist()
-    show(numbers, as_json, _cell_lines(numbers))
-    if cell.verdict != "bistable":
-        raise SystemExit(REFUSED)
+    why = f"the cell t = {t_mm:g} mm, θ = {theta_deg:g}° is {cell.verdict}: {cell.reason}"
+    show(numbers, as_json, _cell_lines(numbers), DONE if cell.verdict == "bistable" else REFUSED, why)
     if output is not None:
+        say(f"drawing its states into {output}")
         found = cell_states(t_mm, theta, sheet)
         if isinstance(found, Failure):
             _refuse(t_mm, theta_deg, found)

@@ -29,6 +29,7 @@ theta_option = click.option("--theta-deg", type=click.FloatRange(-360, 360), req
 jobs_option = click.option(
     "--jobs", type=click.IntRange(-1, 1024), default=-1, show_default=True, help="Processes; -1 is one per core."
 )
+CURVE_WHY = "the smooth curve of cells ends where shallow wells and ragged columns would bend it"
 
 
 def sheet_named(material: str) -> Sheet:
@@ -54,6 +55,7 @@ def summary(library: CellLibrary) -> dict[str, Any]:
     low, high = library.range_ratio()
     return {
         "cells_count": len(library), "range_ratio": [low, high], "spread_ratio": high / low,
+        "curve_range_ratio": _curve_range(library),
         "candidates": library.counts(),
         "reasons": library.reasons(),
         "shallow_count": len(library.shallow_cells()[0]),
@@ -63,6 +65,17 @@ def summary(library: CellLibrary) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _curve_range(library: CellLibrary) -> tuple[float, float] | None:
+    """Return the range of the smooth curve, or None where none runs through so coarse a library."""
+    from design.cells.select import selection_curve
+    from design.errors import DesignError
+
+    try:
+        return selection_curve(library).range_ratio()
+    except DesignError:
+        return None
+
+
 def lines_of(library: CellLibrary) -> Iterator[str]:
     """Yield what a library holds, for a person."""
     from design.cells.homogenise import SHALLOW_WELL_RATIO
@@ -70,6 +83,9 @@ def lines_of(library: CellLibrary) -> Iterator[str]:
     low, high = library.range_ratio()
     sheet = library.sheet
     yield f"{len(library)} bistable cells, expansion {low:.4f} to {high:.4f} (spread {high / low:.3f})"
+    if curve := _curve_range(library):
+        low, high = curve
+        yield f"designs choose from {low:.4f} to {high:.4f} (spread {high / low:.3f}): {CURVE_WHY}"
     if shallow := len(library.shallow_cells()[0]):
         yield (
             f"{shallow} of them were decided at half the mesh size: at the full size their barrier is less than "

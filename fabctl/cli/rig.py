@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fabctl.cli.common import PLACE_MM, bench_option, confirm, json_option, lab, show, yes_option
+from fabctl.cli.common import PLACE_MM, bench_option, confirm, json_option, lab, progress, show, yes_option
+from fabctl.cli.figures import spoken
 
 if TYPE_CHECKING:
     from drivers.rig.indenter import Indenter
@@ -17,6 +19,16 @@ if TYPE_CHECKING:
 
 SPEED_MM_S = click.FloatRange(0, 1000, min_open=True)
 JOG_FORCE_N = 1.0  # an operator's hand-driven motion stops at the first touch
+SHOWN_S, QUIET_S = 0.1, 2.0  # how often a motion is told; what is over within so long needs no telling
+PATIENCE_RATIO, PATIENCE_S = 1.5, 10.0  # of a motion over the whole travel
+
+valid_days_option = click.option(
+    "--valid-days",
+    type=click.IntRange(1, 36_500),
+    default=365,
+    show_default=True,
+    help="After how many days it is past its date.",
+)
 
 
 @click.group()
@@ -28,9 +40,12 @@ def command() -> None:
 @bench_option
 @json_option
 def info(bench_name: str, as_json: bool) -> None:
-    """Say who answers and how it stands; nothing moves."""
+    """Say who answers and how it stands, and where its map contradicts itself; nothing moves."""
+    from drivers.rig.plausible import contradictions
+
     with _rig(bench_name, "asking the rig") as (rig, _):
         identity, air, now = rig.identify(), rig.environment(), rig.fresh_sample()
+        doubts = list(contradictions(rig.registers))
     body = {
         "model": identity.model,
         "serial": identity.serial,
@@ -40,7 +55,8 @@ def info(bench_name: str, as_json: bool) -> None:
         **air,
         **_state(now),
     }
-    show(body, as_json, [f"{name:18} {value}" for name, value in body.items()])
+    lines = [f"{name:18} {spoken(value)}" for name, value in body.items()]
+    show({**body, "doubts": doubts}, as_json, [*lines, *(f"doubt: {each}; is that so?" for each in doubts)])
 
 
 @command.command()
@@ -69,10 +85,11 @@ def tare(bench_name: str, time_s: float, as_json: bool) -> None:
 @json_option
 def home(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
     """Drive up to the home switch, where position is 0."""
-    _moved(bench_name, "home", "Drive up to the home switch?", yes, as_json, lambda rig, _: rig.home(speed_mm_s))
+    way = Way("home", "Drive up to the home switch?", speed_mm_s, lambda _: 0.0, lambda rig, _: rig.home(speed_mm_s))
+    _moved(bench_name, way, yes, as_json)
 
 
-@command.command()
+@command.command(context_settings={"ignore_unknown_options": True})  # -5 is a place, no option
 @click.argument("by_mm", type=PLACE_MM)
 @bench_option
 @click.option("--speed-mm-s", type=SPEED_MM_S, default=1.0, show_default=True, help="How fast the stage moves.")
@@ -87,7 +104,8 @@ def jog(by_mm: float, bench_name: str, speed_mm_s: float, yes: bool, as_json: bo
             return rig.move(goal_mm, speed_mm_s, "above", now.force_N + JOG_FORCE_N)
         return rig.move(goal_mm, speed_mm_s)
 
-    _moved(bench_name, "jog", f"Move {by_mm:+g} mm?", yes, as_json, begin)
+    way = Way("jog", f"Move {by_mm:+g} mm?", speed_mm_s, lambda now: now.position_mm + by_mm, begin)
+    _moved(bench_name, way, yes, as_json)
 
 
 @command.command()
@@ -97,14 +115,9 @@ def jog(by_mm: float, bench_name: str, speed_mm_s: float, yes: bool, as_json: bo
 @json_option
 def retract(bench_name: str, speed_mm_s: float, yes: bool, as_json: bool) -> None:
     """Clear a latched fault and drive up to position 0, slowly; never downwards."""
-    _moved(
-        bench_name,
-        "retract",
-        "Clear the faults and drive up?",
-        yes,
-        as_json,
-        lambda rig, _: rig.move(0.0, speed_mm_s),
-    )
+    question = "Clear the faults and drive up?"
+    way = Way("retract", question, speed_mm_s, lambda _: 0.0, lambda rig, _: rig.move(0.0, speed_mm_s))
+    _moved(bench_name, way, yes, as_json)
 
 
 @command.command()
@@ -139,13 +152,7 @@ def calibrate() -> None:
     show_default=True,
     help="A known mass; one option each.",
 )
-@click.option(
-    "--valid-days",
-    type=click.IntRange(1, 36_500),
-    default=365,
-    show_default=True,
-    help="After how many days it is past its date.",
-)
+@valid_days_option
 @bench_option
 @yes_option
 @json_option
@@ -153,7 +160,6 @@ def calibrate_force_command(
     masses_g: tuple[float, ...], valid_days: int, bench_name: str, yes: bool, as_json: bool
 ) -> None:
     """Lay known masses on the cell, one after the other; nothing moves."""
-    from fabctl.cli.common import progress
     from fabctl.errors import Stopped
     from fabctl.indent.calibrate import calibrate_force, hang_in_slot
 
@@ -193,13 +199,7 @@ def calibrate_force_command(
     show_default=True,
     help="What the block itself gives.",
 )
-@click.option(
-    "--valid-days",
-    type=click.IntRange(1, 36_500),
-    default=365,
-    show_default=True,
-    help="After how many days it is past its date.",
-)
+@valid_days_option
 @bench_option
 @yes_option
 @json_option
@@ -207,7 +207,6 @@ def calibrate_frame_command(
     force_N: float, block_mm_N: float, valid_days: int, bench_name: str, yes: bool, as_json: bool
 ) -> None:
     """Press a rigid block three times: what gives way is the frame."""
-    from fabctl.cli.common import progress
     from fabctl.errors import Stopped
     from fabctl.indent.calibrate import block_in_slot, calibrate_frame
 
@@ -247,36 +246,71 @@ def _rig(bench_name: str, purpose: str) -> Iterator[tuple[Indenter, Bench]]:
         yield rig, bench
 
 
-def _moved(bench_name: str, word: str, question: str, yes: bool, as_json: bool, begin: Any) -> None:
+@dataclass(frozen=True)
+class Way:
+    """One motion by hand: its word, what is asked first, where it goes from a sample on, and what begins it."""
+
+    word: str
+    question: str
+    speed_mm_s: float
+    goal_mm: Callable[[Any], float]  # of the sample before it
+    begin: Callable[[Any, Any], int]  # rig and sample; the command's number
+
+
+def _moved(bench_name: str, way: Way, yes: bool, as_json: bool) -> None:
     """Ask, arm, move, stop, disarm; the stage is stopped on every way out."""
     from drivers.rig.indenter import Limits
     from fabctl.errors import Stopped
+    from fabctl.records.ending import undisturbed
 
-    if not confirm(question, yes):
+    if not confirm(way.question, yes):
         raise Stopped("not moved")
-    with _rig(bench_name, f"{word} of the rig") as (rig, bench):
+    with _rig(bench_name, f"{way.word} of the rig") as (rig, bench):
         config = bench.config.rig
         assert config is not None
         rig.clear_faults()
         rig.set_limits(Limits(config.force_limit_N, -2.0, 0.0, config.travel_mm, 0.5, 50.0, 0.5))
         try:
             now = rig.fresh_sample()
+            rig.hear = _told(way, now)
             rig.arm()
-            after = rig.wait(begin(rig, now), 120.0)
+            rig.wait(way.begin(rig, now), PATIENCE_RATIO * config.travel_mm / way.speed_mm_s + PATIENCE_S)
         finally:
-            rig.stop()
-            rig.disarm()
+            with undisturbed():
+                rig.stop()
+                rig.disarm()
         after = rig.fresh_sample()
-    show(_state(after), as_json, [f"{word}: at {after.position_mm:.3f} mm, {after.force_N:.3f} N gross"])
+    show(_state(after), as_json, [f"{way.word}: at {after.position_mm:.3f} mm, {after.force_N:.3f} N gross"])
+
+
+def _told(way: Way, start: Sample) -> Callable[[Sample], None]:
+    """Return a listener that shows how far a motion has come, some times a second."""
+    from fabctl.events import Event
+
+    tell, whole_mm, shown_s = progress(), way.goal_mm(start) - start.position_mm, start.time_s
+
+    def hear(sample: Sample) -> None:
+        nonlocal shown_s
+        if sample.time_s - shown_s < SHOWN_S:
+            return
+        shown_s = sample.time_s
+        done = (sample.position_mm - start.position_mm) / whole_mm if whole_mm else 0.0
+        words = f"{way.word}: at {sample.position_mm:.2f} mm, {sample.force_N:.3f} N gross"
+        tell(Event("progress", words, min(0.999, max(0.0, done))))
+
+    return hear
 
 
 def _sampled(rig: Indenter, time_s: float) -> list[Sample]:
     from drivers.clock import WallClock
+    from fabctl.events import Event
 
-    clock, found = WallClock(), []
-    until_s = clock.now_s() + time_s
-    while clock.now_s() < until_s:
+    tell, clock, found = progress(), WallClock(), []
+    began_s = clock.now_s()
+    while (past_s := clock.now_s() - began_s) < time_s:
         found.append(rig.fresh_sample())
+        if time_s > QUIET_S:
+            tell(Event("progress", f"{found[-1].force_N:.4f} N, {time_s - past_s:.0f} s left", past_s / time_s))
         clock.sleep(0.01)
     return found
 

@@ -7,10 +7,14 @@ from pathlib import Path
 import click
 
 from fabctl.cli.common import json_option, lab, show
+from fabctl.cli.figures import figures
 from fabctl.cli.paths import RUN, SPECIMEN, OutFile
 from fabctl.records.export import export
 from fabctl.records.folder import status_of
 from fabctl.records.index import Row, reindex, rows
+
+KINDS = ("cut", "marks", "kerf-coupon", "calibrate", "indent", "scan", "coupon-read", "report")
+STATUSES = ("done", "stopped", "failed", "refused", "running", "interrupted", "broken")
 
 
 @click.group("run", no_args_is_help=True)
@@ -20,17 +24,25 @@ def command() -> None:
 
 @command.command("list")
 @click.option("--specimen", type=SPECIMEN, help="Only the runs of this specimen.")
-@click.option("--kind", help="Only runs of this kind (cut, indent, scan, …).")
-@click.option("--status", help="Only runs that ended so (done, stopped, failed, interrupted, …).")
+@click.option("--kind", type=click.Choice(KINDS), help="Only runs of this kind.")
+@click.option("--status", type=click.Choice(STATUSES), help="Only runs that ended so.")
 @json_option
 def list_runs(specimen: str | None, kind: str | None, status: str | None, as_json: bool) -> None:
-    """List all runs, oldest first; a run that nothing ended is *interrupted*."""
+    """List all runs, oldest first; a run that nothing ended is *interrupted*, one on simulators *simulated*."""
     found = [row for row in rows(lab().runs) if _fits(row, specimen, kind, status)]
-    lines = [
-        f"{row.run:38} {row.specimen or '-':8} {row.status:12} {row.message.splitlines()[0] if row.message else ''}"
-        for row in found
-    ]
-    show({"runs": [row.as_dict() for row in found]}, as_json, lines or ["no runs yet"])
+    head = f"{'run':38} {'specimen':8} {'status':12} {'bench':9} result"
+    lines = [head, *map(_line, found)] if found else []
+    show(
+        {"runs": [row.as_dict() for row in found]},
+        as_json,
+        lines or ["no such runs" if specimen or kind or status else "no runs yet"],
+    )
+
+
+def _line(row: Row) -> str:
+    bench = {None: "-", True: "simulated", False: "real"}[row.simulated]
+    said = row.message.splitlines()[0] if row.message else "-"
+    return f"{row.run:38} {row.specimen or '-':8} {row.status:12} {bench:9} {said}"
 
 
 def _fits(row: Row, specimen: str | None, kind: str | None, status: str | None) -> bool:
@@ -52,7 +64,7 @@ def show_run(run: str, as_json: bool) -> None:
         f"specimen  {manifest.get('specimen') or '-'}",
         f"started   {manifest['started_utc']} by {manifest['operator']}",
         *(f"input     {item['path']}  {item['sha256'][:12]}" for item in manifest["inputs"]),
-        *(f"result    {key} = {value}" for key, value in result.items() if not isinstance(value, dict | list)),
+        *(f"result    {line}" for line in figures(result)),
         *(f"file      {name}" for name in files),
     ]
     data = {"run": found.run_id, "path": str(found.path), "status": state, "manifest": manifest, "result": result}

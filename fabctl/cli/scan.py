@@ -335,6 +335,7 @@ def _compared(
 
     try:
         made = compare(request, emit)
+        emit(Event("stage", "drawing the pictures and writing the report"))
         body = record(run, made)
     except KeyboardInterrupt:
         run.finish("stopped", "stopped by the operator")

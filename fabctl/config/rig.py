@@ -120,24 +120,8 @@ class RigMapConfig(Model):
             )
             for name, block in self.blocks.items()
         }
-        return RegisterMap(
-            name=self.name,
-            word_order=self.word_order,
-            exchange=self.exchange,
-            magic=self.magic,
-            version=self.version,
-            tick_s=self.tick_s,
-            timeout_s=self.timeout_s,
-            response_max_s=self.response_max_s,
-            blocks=blocks,
-            states=self.states,
-            faults=self.faults,
-            command_states=self.command_states,
-            reasons=self.reasons,
-            commands=dict(self.commands),
-            heartbeat_s=self.heartbeat_s,
-            clock_drift_ratio=self.clock_drift_ratio,
-        )
+        facts = {name: getattr(self, name) for name in type(self).model_fields if name != "blocks"}
+        return RegisterMap(blocks=blocks, **facts)
 
 
 def load_rig(name: str, home: Path) -> RegisterMap:

@@ -37,8 +37,6 @@ from fabctl.events import Emit, Event
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.workspace import Specimen, Workspace
 
-SAMPLE_ID = "S-0000"  # stands for the id until the operator has said yes
-
 Compose = Callable[[str, float], tuple[str, ...]]
 """From the specimen's id and the board's full power ($30) to G-code lines in sheet coordinates."""
 
@@ -135,7 +133,7 @@ def cut(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, dry_run: bool
         with ExitStack() as stack:
             with kept(lab, bench, order, dry_run):
                 laser = stack.enter_context(laser_on(bench, log))
-                plan = _plan(laser, bench, order, SAMPLE_ID)
+                plan = _plan(laser, bench, order, lab.next_id())
                 if any(finding.code == "CUT-ZERO" for finding in plan.findings):
                     order = replace(order, frame=True)  # where zero is, only the operator knows: let it be seen
                 tell_warnings(plan.findings, desk.emit)
@@ -250,7 +248,7 @@ def _cut_now(lab: Workspace, bench: Bench, order: CutOrder, desk: Desk, laser: L
         if order.eye is not None:
             order.eye.look_again()
         specimen = lab.new_specimen(order.design) if order.kind != "marks" else None
-        plan = _plan(laser, bench, order, specimen.name if specimen is not None else SAMPLE_ID)
+        plan = _plan(laser, bench, order, specimen.name if specimen is not None else "")
         _refuse(plan.findings)
     facts = {
         "bench": bench.config.model_dump(mode="json"),

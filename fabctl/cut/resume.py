@@ -8,7 +8,7 @@ last. Asked before anything moves.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,7 +19,7 @@ from design.findings import Finding, errors
 from drivers.grbl.laser import Laser
 from drivers.grbl.messages import Report, Vector
 from drivers.grbl.settings import Identity
-from fabctl.bench import Bench
+from fabctl.bench import Bench, begun_elsewhere
 from fabctl.config.bench import LaserConfig
 from fabctl.config.loader import parse
 from fabctl.config.material import MaterialConfig
@@ -45,7 +45,7 @@ from fabctl.cut.preflight import preflight
 from fabctl.cut.program import Program, read_program
 from fabctl.cut.progress import Place
 from fabctl.cut.recorded import has_begun, how_to_go_on, recorded
-from fabctl.cut.trail import burnt_before_mm, last_seen, read_trail, rest_of, stopped_at
+from fabctl.cut.trail import EXACT_MM, burnt_before_mm, last_seen, read_trail, rest_of, stopped_at
 from fabctl.cut.wirelog import WireLog
 from fabctl.errors import RefusedError, Stopped, UsageError
 from fabctl.events import Event
@@ -152,18 +152,14 @@ def _interrupted(path: Path) -> RunFolder:
 
 def _against(before: RunFolder, bench: Bench, order: CutOrder) -> list[Finding]:
     """Return what the record has against going on here, with this material."""
-    found, config = [], before.manifest()["config"]
-    there, material = config["bench"]["name"], material_of(before).name
-    if there != bench.config.name:
-        text = f"{before.run_id} was cut on bench {there}, this is {bench.config.name}"
-        found.append(Finding("RESUME-BENCH", text, hint="resume where the sheet lies"))
+    found, material = begun_elsewhere(before, bench.config), material_of(before).name
     if order.material.name != material:
         text = f"{before.run_id} cuts {material} with the powers of its preset, not {order.material.name}"
         found.append(Finding("RESUME-MATERIAL", text, hint="leave --material out"))
     if not has_begun(before):
         text = f"{before.run_id} ended before anything was cut"
         found.append(Finding("RESUME-EMPTY", text, hint=how_to_go_on(before)))
-    if sha256(before.artefact("job.nc")) != config["plan"]["job_sha256"]:
+    if sha256(before.artefact("job.nc")) != before.manifest()["config"]["plan"]["job_sha256"]:
         text = f"the program of {before.run_id} is not the one sent"
         found.append(Finding("RESUME-PROGRAM", text, hint="cut the design anew"))
     return found
@@ -207,10 +203,23 @@ def _stopped(
     """Return where the machine stands on the program, None with its position lost; and where it was seen last."""
     times, log = program_times(program, identity), before.path / "wire.log"
     trail = read_trail(log.read_text(encoding="ascii", errors="replace"), program, times, offset_mm)
-    lost = (before.outcome() or {}).get("position_known") is False
+    lost = _lost(before.outcome() or {}, identity, report)
     elapsed_s = max(time.time() - log.stat().st_mtime, 0.0)
     stood = None if lost else stopped_at(trail, program, times, report, offset_mm, elapsed_s)
     return stood, last_seen(trail, program)
+
+
+def _lost(outcome: Mapping[str, Any], identity: Identity, report: Report) -> bool:
+    """Return whether the record says that the board's place means nothing any more.
+
+    A board without homing that was switched off counts from elsewhere: only one that is where it was left is believed.
+    """
+    if outcome.get("position_known") is False:
+        return True
+    left_mm, now_mm = outcome.get("machine_mm"), report.machine_mm
+    if identity.is_on(22) or left_mm is None or now_mm is None:
+        return False
+    return any(abs(a - b) > EXACT_MM for a, b in zip(left_mm[:2], now_mm[:2], strict=True))
 
 
 def _can_home(order: CutOrder, config: LaserConfig, identity: Identity) -> bool:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fabctl.errors import RecordError
+from fabctl.errors import RecordError, UsageError
 from fabctl.indent.curve import CurveResult, Snap, Strokes, Valued, analyse_curve
 from fabctl.indent.recorder import COLUMNS
-from fabctl.records.folder import RunFolder
+from fabctl.records.folder import RunFolder, status_of
 
 Reals = NDArray[np.float64]
 SUMMARY = (
@@ -57,6 +57,16 @@ class Numbered:
     point: int
     curve: int
     result: CurveResult
+
+
+def samples_of(run: RunFolder) -> Path:
+    """Return where a run's samples lie; raise `UsageError` where it is none that has any, and say what it is."""
+    kind, path = run.manifest().get("kind"), run.path / "samples.csv"
+    if kind not in ("indent", "calibrate"):
+        raise UsageError(f"{run.run_id}: not an indentation but a {kind}; `fabctl run list --kind indent` names those")
+    if not path.is_file():
+        raise UsageError(f"{run.run_id}: holds no samples, nothing was pressed ({status_of(run)})")
+    return path
 
 
 def read_samples(path: Path) -> Samples:
@@ -159,6 +169,8 @@ def _one(numbered: Numbered) -> dict[str, Any]:
         "contact_others_mm": dict(contact.others_mm),
         "noise_N": contact.noise_N,
         "drift_N_mm": contact.drift_N_mm,
+        "drift_N_mm2": contact.drift_N_mm2,
+        "spikes_count": result.spikes_count,
         "depth_max_mm": result.depth_max_mm,
         "not_found": dict(result.reasons),
     }
@@ -208,7 +220,7 @@ def summarise_run(run: RunFolder) -> dict[str, Any]:
     compliance = float(calibration.get("compliance_mm_N") or 0.0)
     gain = float(calibration.get("gain_ratio") or 1.0)
     secant = float(config.get("method", {}).get("secant_mm", 2.0))
-    found = analyse(read_samples(run.path / "samples.csv"), compliance, secant, gain)
+    found = analyse(read_samples(samples_of(run)), compliance, secant, gain)
     conditioning = conditioning_curves(run.manifest())
     body = summarised(found, conditioning)
     body |= {"compliance_mm_N": compliance, "gain_ratio": gain, "secant_mm": secant}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -11,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from drivers.clock import Clock, WallClock
-from drivers.errors import DeviceError
 from drivers.rig.indenter import Indenter
 from fabctl.config.bench import RigConfig
 from fabctl.config.method import Approach, Cycles, LimitsConfig, MethodConfig, Tare
@@ -29,11 +29,13 @@ from fabctl.indent.calibration import (
 from fabctl.indent.method import actions
 from fabctl.indent.recorder import Recorder
 from fabctl.indent.run import Runner
+from fabctl.records.ending import outcome_kept
 from fabctl.records.folder import RunFolder, start_run
 
 MASS_TOLERANCE_RATIO = 5e-5  # OIML class M1 from 100 g on, as a standard uncertainty
 SETTLE_S = 0.5
 READ_S = 2.0
+GIVES_MM = 3.0  # no frame that is of use gives so much under a calibration's force
 LOW_FRAC = 0.25  # below a quarter of the load a block is not yet well seated
 
 
@@ -97,15 +99,24 @@ def frame_method(rig: RigConfig, force_N: float) -> MethodConfig:
 
 def frame_result(samples: Path, gain_ratio: float, block_mm_N: float = 0.0) -> dict[str, Any]:
     """Return the frame's compliance: the slope of position over true force, less what the block itself gives."""
-    slopes = []
+    slopes, most_N = [], 0.0
     for _, _, strokes in strokes_of(read_samples(samples)):
         force = strokes.load_N / gain_ratio
-        seated = force > LOW_FRAC * force.max()
+        most_N = max(most_N, float(force.max()))
+        seated = force > LOW_FRAC * most_N
         if seated.sum() >= 10:
             slopes.append(fit_line(list(force[seated]), list(strokes.load_position_mm[seated])).slope)
     if len(slopes) < 2:
         raise CalibrationRefused("too few samples under load; press slower or with more force")
     compliance = float(np.mean(slopes)) - block_mm_N
+    if compliance < 0:
+        raise CalibrationRefused(
+            f"all that gives way is {compliance + block_mm_N:.5f} mm/N, the block alone is said to give "
+            f"{block_mm_N:g} mm/N; check --block-mm-N"
+        )
+    if compliance * most_N > GIVES_MM:
+        gives = f"{compliance * most_N:.1f} mm under {most_N:.1f} N"
+        raise CalibrationRefused(f"what was pressed gives {gives}: is it a rigid block, and not a specimen?")
     return {
         "compliance_mm_N": compliance,
         "compliance_se_mm_N": float(np.std(slopes, ddof=1) / np.sqrt(len(slopes))),
@@ -126,26 +137,19 @@ def calibrate_force(
 ) -> tuple[RunFolder, dict[str, Any]]:
     """Calibrate the load cell, keep the record, and make it the bench's current one."""
     run = start_run(lab / "runs", "calibrate", config={"what": "force", "bench": bench, "masses_kg": list(masses_kg)})
-    try:
+    with outcome_kept(run):
         body = force_result(read_masses(rig, masses_kg, put_on, clock or WallClock(), emit))
-    except (DeviceError, FabctlError) as fault:
-        run.finish("failed", str(fault))
-        raise
-    before = load_calibration(lab, bench) or Calibration()
-    save_calibration(
-        lab,
-        bench,
-        replace(
-            before,
-            gain_ratio=body["gain_ratio"],
-            gain_se_ratio=body["gain_se_ratio"],
-            force_run=run.run_id,
-            force_utc=datetime.now(UTC).isoformat(),
-            force_valid_days_count=valid_days_count,
-        ),
+        run.write_result(body)
+        run.finish("done")
+    known = replace(
+        load_calibration(lab, bench) or Calibration(),
+        gain_ratio=body["gain_ratio"],
+        gain_se_ratio=body["gain_se_ratio"],
+        force_run=run.run_id,
+        force_utc=datetime.now(UTC).isoformat(),
+        force_valid_days_count=valid_days_count,
     )
-    run.write_result(body)
-    run.finish("done")
+    save_calibration(lab, bench, known)
     return run, body
 
 
@@ -164,31 +168,21 @@ def calibrate_frame(
     method = frame_method(config, force_N)
     run = start_run(lab / "runs", "calibrate", config={"what": "frame", "bench": bench, "method": method.model_dump()})
     before = load_calibration(lab, bench) or Calibration()
-    recorder = Recorder(run.path / "samples.csv")
-    try:
-        runner = Runner(rig, method, actions(method), recorder, clock or WallClock(), config.sample_hz, emit)
-        try:
-            runner.execute()
-        finally:
-            recorder.close()
+    with outcome_kept(run):
+        with contextlib.closing(Recorder(run.path / "samples.csv")) as recorder:
+            Runner(rig, method, actions(method), recorder, clock or WallClock(), config.sample_hz, emit).execute()
         body = frame_result(run.path / "samples.csv", before.gain_ratio or 1.0, block_mm_N)
-    except (DeviceError, FabctlError) as fault:
-        run.finish("failed", str(fault))
-        raise
-    save_calibration(
-        lab,
-        bench,
-        replace(
-            before,
-            compliance_mm_N=body["compliance_mm_N"],
-            compliance_se_mm_N=body["compliance_se_mm_N"],
-            frame_run=run.run_id,
-            frame_utc=datetime.now(UTC).isoformat(),
-            frame_valid_days_count=valid_days_count,
-        ),
+        run.write_result(body)
+        run.finish("done")
+    known = replace(
+        before,
+        compliance_mm_N=body["compliance_mm_N"],
+        compliance_se_mm_N=body["compliance_se_mm_N"],
+        frame_run=run.run_id,
+        frame_utc=datetime.now(UTC).isoformat(),
+        frame_valid_days_count=valid_days_count,
     )
-    run.write_result(body)
-    run.finish("done")
+    save_calibration(lab, bench, known)
     return run, body
 
 

@@ -17,12 +17,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fabctl.indent.freepart import FREE_MIN, WIDTH, Free, find_free
+from fabctl.indent.freepart import FREE_MIN, WIDTH, Free, find_free, noise_of_N, without_spikes
 
 Reals = NDArray[np.float64]
 
 SLOPED, HERTZIAN = (1.0, 2.0, 3.0), (1.5, 2.5, 3.5)
 RISE = 2  # the column of the first power: how the force begins
+FALL_SIGMA, NEVER = 0.3, 1e6  # a start that falls by so much of the noise again is none: its chi² is taken for more
+STEEP_N_MM = 1e3  # a drift of which nothing is expected
+BENT_SIGMA = 4.0  # a free part curved by so many standard errors is asked whether its drift bends
+NEAR_FRAC, NEAR_MM = 0.4, 1.0  # and the fit with a bent free part reaches so far towards the first maximum
 CLEARLY = 12.0  # by how much chi² must fall before a Hertzian start is believed instead of a sloped one
 MISFIT_SIGMA = 4.0  # a window is too long where chi² exceeds its mean by so many of its standard deviations
 AGREE_SIGMA = 1.5  # and where its contact lies outside so many standard errors of a shorter window's
@@ -39,8 +43,8 @@ class Contact:
 
     `position_mm` is None where it was not found; `reason` says why. `slope_N_mm` is the stiffness at contact with its
     standard error; None for a Hertzian start, which has none. `drift_N_mm` is the slope of the free part where it is
-    evident, else 0. `kind` is `zero` where the curve begins under a preload and depth is counted from the method's
-    zero, at which the force was `start_N`.
+    evident, else 0; where it bends (`drift_N_mm2`) its slope at contact. `kind` is `zero` where the curve begins under
+    a preload and depth is counted from the method's zero, at which the force was `start_N`.
     """
 
     position_mm: float | None
@@ -53,6 +57,7 @@ class Contact:
     baseline_N: float = 0.0
     baseline_N_mm: float = 0.0
     drift_N_mm: float = 0.0
+    drift_N_mm2: float = 0.0
     start_N: float = 0.0
     others_mm: tuple[tuple[str, float], ...] = ()
 
@@ -69,11 +74,21 @@ class Fit:
 
     contact_mm: float
     powers: tuple[float, ...]
-    coefficients: Reals  # (2 + powers,): level, drift, then a_p
-    covariance: Reals  # (3 + powers, …): contact last
+    coefficients: Reals  # (2 + powers,): level, drift, then a_p; and the drift's parabola where it bends
+    covariance: Reals  # square, one more: contact last
     se_mm: float
     chi2: float
     count: int
+
+    @property
+    def bend_N_mm2(self) -> float:
+        """Return the drift's parabola, 0 where none was fitted."""
+        return float(self.coefficients[-1]) if len(self.coefficients) > RISE + len(self.powers) else 0.0
+
+    @property
+    def misfit(self) -> float:
+        """Return by how many of its standard deviations chi² exceeds its mean."""
+        return (self.chi2 - self.count) / float(np.sqrt(2 * self.count))
 
 
 def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
@@ -84,10 +99,11 @@ def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
         return Contact(None, free)
     level_N, noise_N = free.level_N, free.noise_N
     others = _opinions(u, f, free.start, level_N, noise_N)
-    best = _best_fit(u, f, free)
-    if best is None:
+    straight = _best_fit(u, f, free)
+    if straight is None:
         reason = "no window after the rise is long enough to fit"
         return Contact(None, reason, noise_N=noise_N, baseline_N=level_N, others_mm=others)
+    best = _with_bend(u, f, free, straight)
     # Between two samples nothing is known of how the contact begins.
     se_mm = float(np.hypot(best.se_mm, np.median(np.diff(u)) / np.sqrt(12)))
     sloped = best.powers == SLOPED
@@ -100,7 +116,8 @@ def find_contact(position_mm: Reals, force_N: Reals) -> Contact:
         noise_N=noise_N,
         baseline_N=float(best.coefficients[0]),
         baseline_N_mm=float(best.coefficients[1]),
-        drift_N_mm=free.slope_N_mm,
+        drift_N_mm=float(best.coefficients[1]) if best.bend_N_mm2 else free.slope_N_mm,
+        drift_N_mm2=best.bend_N_mm2,
         others_mm=others,
     )
     if se_mm > SE_MAX_MM:
@@ -114,6 +131,8 @@ def first_touch(position_mm: Reals, force_N: Reals) -> float | None:
 
     Quick, some milliseconds: it is asked between two samples, while a watchdog waits for the next.
     """
+    if len(force_N) > 3 * FREE_MIN:
+        force_N, _ = without_spikes(force_N, noise_of_N(position_mm, force_N)[0])
     u, f = _thinned(position_mm, force_N, TOUCH_COUNT, TOUCH_MM)
     free = find_free(u, f)
     if isinstance(free, str):
@@ -149,15 +168,65 @@ def _best_fit(u: Reals, f: Reals, free: Free) -> Fit | None:
         sloped = _scan(u[:end], f[:end], *around, SLOPED, free)
         hertzian = _scan(u[:end], f[:end], *around, HERTZIAN, free)
         found = _chosen(sloped, hertzian)
-        misfit = (found.chi2 - found.count) / np.sqrt(2 * found.count)
         # With what the same kind of start said before: that a longer window shows the kind is no disagreement.
         before = [kinds[found.powers] for kinds in shorter]
         agrees = all(abs(found.contact_mm - one.contact_mm) <= AGREE_SIGMA * one.se_mm for one in before)
-        if taken and taken[-1].se_mm < SE_GOOD_MM and (misfit > MISFIT_SIGMA or not agrees):
+        if taken and taken[-1].se_mm < SE_GOOD_MM and (found.misfit > MISFIT_SIGMA or not agrees):
             break
         taken.append(found)
         shorter.append({SLOPED: sloped, HERTZIAN: hertzian})
     return taken[-1] if taken else None
+
+
+def _with_bend(u: Reals, f: Reals, free: Free, straight: Fit) -> Fit:
+    """Return the fit with a parabola for the free part where that explains all clearly better, else `straight`.
+
+    A drift that bends is else taken for the specimen. The part must be curved, and the parabola better than a straight
+    line with one power more under load, and than a corner, which is where a specimen is met that stiffens later. The
+    error holds how far the contact lies off without the first half of the free part, and the other view as far as it
+    is likely.
+    """
+    bends = replace(free, bends=True)
+    top_mm = float(u[int(np.argmax(f[free.start :])) + free.start])
+    contact_mm = straight.contact_mm
+    for _ in range(2):  # from a contact that is early the first look ends early too
+        end = int(np.searchsorted(u, contact_mm + max(NEAR_FRAC * (top_mm - contact_mm), NEAR_MM)))
+        found = _wherever(u[:end], f[:end], (SLOPED, HERTZIAN), bends)
+        contact_mm = found.contact_mm
+    worse = _worse_than_a_corner(u, f, contact_mm, free)
+    if found.misfit > MISFIT_SIGMA or worse is None:
+        return straight
+    plain = _wherever(u[:end], f[:end], ((*SLOPED, 4.0), (*HERTZIAN, 4.5)), free)
+    if plain.chi2 - found.chi2 < CLEARLY:
+        return straight
+    likely = 1 / (1 + float(np.exp(np.clip(worse / 2, -50, 50))))
+    apart_mm = contact_mm - straight.contact_mm
+    if worse > 0:
+        return replace(straight, se_mm=float(np.hypot(straight.se_mm, likely * apart_mm)))
+    later = int(np.searchsorted(u, (float(u[0]) + contact_mm) / 2))
+    half = _wherever(u[later:end], f[later:end], (SLOPED, HERTZIAN), bends)
+    doubts = (found.se_mm, half.contact_mm - contact_mm, (1 - likely) * apart_mm)
+    return replace(found, se_mm=float(np.linalg.norm(doubts)))
+
+
+def _wherever(u: Reals, f: Reals, kinds: tuple[tuple[float, ...], tuple[float, ...]], free: Free) -> Fit:
+    """Return the better of two kinds of start, sloped and Hertzian, looked for along the whole of what is given."""
+    around = (float(u[0]), 0.0, float(u[-1] - u[0]))
+    return _chosen(_scan(u, f, *around, kinds[0], free), _scan(u, f, *around, kinds[1], free))
+
+
+def _worse_than_a_corner(u: Reals, f: Reals, until_mm: float, free: Free) -> float | None:
+    """Return by how much chi² a parabola is worse than a corner before `until_mm`; None where nothing is curved."""
+    x, part = u[u < until_mm], f[u < until_mm]
+    if len(x) < 2 * FREE_MIN:
+        return None
+    design = np.vander((x - x.mean()) / float(np.ptp(x)), 3)
+    weights = np.linalg.lstsq(design, part, rcond=None)[0]
+    off = part - design @ weights
+    if abs(weights[0]) < BENT_SIGMA * free.noise_N * np.sqrt(np.linalg.inv(design.T @ design)[0, 0]):
+        return None
+    corner = _scan(x, part, float(x[0]), 0.0, float(np.ptp(x)), (1.0,), replace(free, drift_N_mm=STEEP_N_MM))
+    return float(off @ off) / free.noise_N**2 - corner.chi2
 
 
 def _chosen(sloped: Fit, hertzian: Fit) -> Fit:
@@ -203,7 +272,7 @@ def _fit_at(u: Reals, f: Reals, contact_mm: float, powers: tuple[float, ...], fr
         coefficients = np.insert(np.linalg.lstsq(np.delete(design, RISE, 1), wanted, rcond=None)[0], RISE, 0.0)
     residual = wanted - design @ coefficients
     away = np.maximum(u - contact_mm, 1e-9)
-    slope = sum(-a * p * away ** (p - 1) * (u > contact_mm) for a, p in zip(coefficients[2:], powers, strict=True))
+    slope = sum(-a * p * away ** (p - 1) * (u > contact_mm) for a, p in zip(coefficients[2:], powers, strict=False))
     jacobian = np.column_stack([design, np.append(slope, 0.0)])
     covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-13) * free.noise_N**2
     se_mm = max(float(np.sqrt(covariance[-1, -1])), valley_mm)
@@ -213,14 +282,20 @@ def _fit_at(u: Reals, f: Reals, contact_mm: float, powers: tuple[float, ...], fr
 
 
 def _system(u: Reals, f: Reals, contact_mm: float, powers: Sequence[float], free: Free) -> tuple[Reals, Reals]:
-    """Return columns and right side; a last row expects the free part to slope by no more than the drift."""
+    """Return columns and right side; a last row expects the free part to slope by no more than the drift.
+
+    Where that bends nothing is expected of it, and its parabola is the last column: under load it is one with a_2.
+    """
     away = np.maximum(u - contact_mm, 0.0)
-    design = np.zeros((len(u) + 1, 2 + len(powers)))
+    design = np.zeros((len(u) + 1, 2 + len(powers) + free.bends))
     design[:-1, 0] = 1.0
     design[:-1, 1] = u - contact_mm
     for k, power in enumerate(powers):
         design[:-1, 2 + k] = away**power
-    design[-1, 1] = free.noise_N / free.drift_N_mm
+    if free.bends:
+        design[:-1, -1] = (u - contact_mm) ** 2
+    else:
+        design[-1, 1] = free.noise_N / free.drift_N_mm
     return design, np.append(f, 0.0)
 
 
@@ -234,8 +309,16 @@ def _cost(u: Reals, f: Reals, contact_mm: float, powers: Sequence[float], free: 
         # No specimen pulls the indenter in where it is touched: such a fit follows the noise before contact.
         less = np.delete(np.delete(square, RISE, 0), RISE, 1)
         weights = np.insert(np.linalg.solve(less, np.delete(right, RISE)), RISE, 0.0)
+    rising = slice(int(np.searchsorted(u, contact_mm)), int(np.searchsorted(u, free.rise_mm)))
+    loaded = slice(RISE, RISE + len(powers))
     residual = wanted - scaled @ weights
-    return float(residual @ residual)
+    falls = _falls_back(scaled[rising, loaded] @ weights[loaded], FALL_SIGMA * free.noise_N)
+    return float(residual @ residual) + falls * NEVER * free.noise_N**2
+
+
+def _falls_back(load_N: Reals, by_N: float) -> bool:
+    """Tell whether a force falls on its way to the sure rise: such a fit follows the noise before contact, too."""
+    return len(load_N) > 1 and bool(np.any(np.maximum.accumulate(load_N) - load_N > by_N))
 
 
 def _opinions(u: Reals, f: Reals, start: int, level_N: float, noise_N: float) -> tuple[tuple[str, float], ...]:

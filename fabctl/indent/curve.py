@@ -6,20 +6,19 @@ None, and `reasons` says why.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fabctl.indent.contact import Contact, find_contact
-from fabctl.indent.freepart import noise_of_N
+from fabctl.indent.extremum import vertex
+from fabctl.indent.freepart import noise_of_N, without_spikes
 
 Reals = NDArray[np.float64]
 
 LOCAL_MM = 0.35  # half the width of the local fits: some indenter-radius percent, many samples
 SMOOTH_MM = 0.6  # over a third of it the force is smoothed to look for extrema
-VERTEX_MM = (1.5, 2.0, 2.5, 3.0, 1.0, 0.6)  # half the widths over which an extremum is fitted, in their order
-AGREE_SIGMA, MISFIT_SIGMA = 3.0, 4.0  # a wider one must agree with the one before, and be followed by the cubic
 PROMINENCE_SIGMA = 6.0  # a peak must stand out of the noise by so much
 SNAP_SIGMA = 8.0  # a snap is a fall of the force between two samples of at least so many noises
 SNAP_RATE = 6.0  # and of at least so many times the steepest change elsewhere
@@ -68,6 +67,7 @@ class CurveResult:
     """What one curve says; None where it says nothing, with the reason under the figure's name in `reasons`."""
 
     contact: Contact
+    spikes_count: int = 0  # single samples that stood out and were left out
     stiffness_initial_N_mm: Valued | None = None
     stiffness_secant_N_mm: Valued | None = None
     stiffness_tangent_max_N_mm: Valued | None = None
@@ -97,10 +97,11 @@ class CurveResult:
 
 def analyse_curve(strokes: Strokes, compliance_mm_N: float = 0.0, secant_mm: float = 2.0) -> CurveResult:
     """Return what the curve says, the frame's `compliance_mm_N` removed from every depth."""
+    strokes, spikes_count = _calmed(strokes)
     u = strokes.load_position_mm - compliance_mm_N * strokes.load_N
     contact = _counted_from(u, strokes, compliance_mm_N)
     if contact.position_mm is None:
-        return CurveResult(contact, reasons={"contact_mm": contact.reason})
+        return CurveResult(contact, spikes_count=spikes_count, reasons={"contact_mm": contact.reason})
     depth = u - contact.position_mm
     free_N = contact.baseline_N
     load_N = strokes.load_N - free_N - contact.baseline_N_mm * np.minimum(depth, 0.0)
@@ -117,6 +118,7 @@ def analyse_curve(strokes: Strokes, compliance_mm_N: float = 0.0, secant_mm: flo
     found |= _held(strokes, free_N, contact.position_mm, compliance_mm_N, reasons)
     return CurveResult(
         contact,
+        spikes_count=spikes_count,
         depth_max_mm=float(depth.max()),
         force_max_N=float(load_N.max()),
         reasons=reasons,
@@ -126,6 +128,17 @@ def analyse_curve(strokes: Strokes, compliance_mm_N: float = 0.0, secant_mm: flo
         unload_N=unload_N,
         **found,  # type: ignore[arg-type]
     )
+
+
+def _calmed(strokes: Strokes) -> tuple[Strokes, int]:
+    """Return the strokes without disturbances of single samples, and how many they were."""
+    found: list[Reals] = []
+    count = 0
+    for u, force_N in ((strokes.load_position_mm, strokes.load_N), (strokes.unload_position_mm, strokes.unload_N)):
+        noise_N = noise_of_N(u, force_N)[0] if len(u) >= ENOUGH_COUNT else np.inf
+        calm_N, more = without_spikes(force_N, noise_N)
+        found, count = [*found, calm_N], count + more
+    return replace(strokes, load_N=found[0], unload_N=found[1]), count
 
 
 def _counted_from(u: Reals, strokes: Strokes, compliance_mm_N: float) -> Contact:
@@ -203,13 +216,13 @@ def _extrema(depth: Reals, load_N: Reals, noise_N: float, reasons: dict[str, str
     first = _first_maximum(smooth, loaded, band)
     if first is None:
         return _none(reasons, "the force rises to the end of the loading", "peak", "valley")
-    peak = _vertex(depth, load_N, first)
+    peak = vertex(depth, load_N, first)
     found: dict[str, object] = {"peak_depth_mm": peak[0], "peak_N": peak[1]}
     after = np.arange(first, loaded[-1] + 1)
     lowest = int(after[int(np.argmin(smooth[after]))])
     if lowest >= loaded[-1] - 3 or smooth[lowest:].max() - smooth[lowest] < band:
         return found | _none(reasons, "the force falls to the end of the loading", "valley")
-    valley = _vertex(depth, load_N, lowest)
+    valley = vertex(depth, load_N, lowest)
     return found | {"valley_depth_mm": valley[0], "valley_N": valley[1]}
 
 
@@ -222,57 +235,6 @@ def _first_maximum(smooth: Reals, loaded: NDArray[np.intp], band: float) -> int 
         elif smooth[best] - smooth[k] > band:
             return best
     return None
-
-
-def _vertex(depth: Reals, force_N: Reals, near: int) -> tuple[float, float]:
-    """Return depth and force of the extremum near a sample: where a fitted cubic's slope is nothing, else the sample.
-
-    The widest window that the cubic follows and that agrees with the one before: noise counts with its width^-1.5.
-    Narrow ones, where a noise may tilt the cubic by much, only where it follows no other.
-    """
-    centre = float(depth[near])
-    found: Vertex | None = None
-    for half_mm in VERTEX_MM:
-        wider = _cubic_vertex(depth, force_N, centre, half_mm)
-        if wider is None:
-            continue
-        if found is not None and half_mm < VERTEX_MM[0]:
-            break
-        if found is not None and abs(wider.depth_mm - found.depth_mm) > AGREE_SIGMA * found.se_mm:
-            break
-        found = wider
-    return (centre, float(force_N[near])) if found is None else (found.depth_mm, found.force_N)
-
-
-@dataclass(frozen=True, slots=True)
-class Vertex:
-    """An extremum from a fitted cubic, with the standard error of its depth."""
-
-    depth_mm: float
-    force_N: float
-    se_mm: float
-
-
-def _cubic_vertex(depth: Reals, force_N: Reals, centre_mm: float, half_mm: float) -> Vertex | None:
-    """Return the extremum of a cubic fitted within `half_mm`, or None where it has none there or does not follow."""
-    inside = np.abs(depth - centre_mm) <= half_mm
-    count = int(inside.sum())
-    if count < 12:
-        return None
-    x, f = (depth[inside] - centre_mm) / half_mm, force_N[inside]
-    design = np.vander(x, 4, increasing=True)
-    a, *_ = np.linalg.lstsq(design, f, rcond=None)
-    variance = float(np.sum((f - design @ a) ** 2)) / (count - 4)
-    quiet = float(np.var(np.diff(f))) / 2
-    roots = [float(r.real) for r in np.roots([3 * a[3], 2 * a[2], a[1]]) if abs(r.imag) < 1e-9 and abs(r.real) < 1]
-    if not roots or variance > quiet * (1 + MISFIT_SIGMA * np.sqrt(3 / count)) + 1e-18:
-        return None
-    at = min(roots, key=abs)
-    bend = 2 * a[2] + 6 * a[3] * at
-    way = np.array([0.0, 1.0, 2 * at, 3 * at**2])
-    slope_se = float(np.sqrt(way @ np.linalg.inv(design.T @ design) @ way * variance))
-    se_mm = half_mm * slope_se / max(abs(float(bend)), 1e-12)
-    return Vertex(centre_mm + half_mm * at, float(np.polynomial.polynomial.polyval(at, a)), se_mm)
 
 
 def _snaps(

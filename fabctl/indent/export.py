@@ -11,6 +11,7 @@ from typing import Any
 from uuid import NAMESPACE_URL, uuid5
 
 from fabctl.errors import RecordError, UsageError
+from fabctl.indent.analysis import samples_of
 from fabctl.indent.recorder import COLUMNS
 from fabctl.records.folder import RunFolder, status_of
 
@@ -35,10 +36,7 @@ def export(run: RunFolder, kind: str, path: Path) -> dict[str, Any]:
 
 
 def _columns(run: RunFolder) -> Columns:
-    path = run.path / "samples.csv"
-    if not path.is_file():
-        raise RecordError(f"{run.run_id}: holds no samples")
-    text = path.read_text(encoding="utf-8")
+    text = samples_of(run).read_text(encoding="utf-8")
     lines = text.splitlines() if text.endswith("\n") else text.splitlines()[:-1]
     columns: Columns = {name: [] for name in COLUMNS}
     for row in csv.DictReader(lines):

@@ -19,7 +19,9 @@ WIDTH = 8  # samples of the running mean that shows a rise
 SURE_COUNT = 40  # free samples that tell the noise better than the whole curve does
 SLOW_RATIO, STRAIGHT_MM = 1.5, 0.8  # noise is slow beyond this ratio, seen over a stretch that short
 LEAST_N = 1e-6  # a noise of nothing would let every rounding count
+SPIKE_SIGMA = 12.0  # a sample so many noises off both its sides is a disturbance
 SIGNAL = 8.0  # the force must exceed the noise by this factor
+SURE_FRAC = 0.2  # of the way to the greatest force: there the specimen is met for sure
 BAND_SIGMA, BAND_FRAC = 4.5, 0.004  # a mean outside so many standard errors, and so much of the range, has risen
 DRIFT_N_MM = 2e-3  # how much the free part is expected to slope: drift over speed
 DRIFT_SIGMA = 2.0  # a slope is believed beyond so many of its standard errors
@@ -28,9 +30,10 @@ DRIFT_MAX_FRAC = 0.3  # a free part that climbs by more than this share of the l
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """The free part of a curve. `start` is the index of the first sure rise.
+    """The free part of a curve. `start` is the index of the first sure rise, `rise_mm` its position.
 
-    `slope_N_mm` is the drift where it is evident, else 0; `drift_N_mm` is what the free part may be expected to slope.
+    `slope_N_mm` is the drift where it is evident, else 0; `drift_N_mm` is what the free part may be expected to slope;
+    where it `bends` nothing is expected.
     """
 
     start: int
@@ -38,6 +41,8 @@ class Free:
     noise_N: float
     slope_N_mm: float = 0.0
     drift_N_mm: float = DRIFT_N_MM
+    rise_mm: float = -np.inf
+    bends: bool = False
 
 
 def find_free(u: Reals, f: Reals) -> Free | str:
@@ -47,6 +52,8 @@ def find_free(u: Reals, f: Reals) -> Free | str:
     first_N, slow_ratio = noise_of_N(u, f)
     slope_N_mm, drift_N_mm = _drift(u, f, first_N)
     straight = f - slope_N_mm * (u - u[0])
+    if slope_N_mm and _comes_back(f, _followed(straight, first_N, slow_ratio)):
+        slope_N_mm, drift_N_mm, straight = 0.0, DRIFT_N_MM, f
     drifts = f", a drift of {1000 * slope_N_mm:.1f} mN/mm taken off" if slope_N_mm else ""
     if _means(straight).max() - np.median(straight[:HEAD_COUNT]) < SIGNAL * first_N / np.sqrt(WIDTH):
         return f"the force never leaves the noise of {1000 * first_N:.1f} mN{drifts}"
@@ -63,7 +70,7 @@ def find_free(u: Reals, f: Reals) -> Free | str:
             f"before the rise the force already climbs by {1000 * slope_N_mm:.1f} mN/mm, after it by "
             f"{1000 * steepest_N_mm:.1f}: the curve begins in contact, or the load cell drifts too much"
         )
-    return Free(start, level_N, settled_N, slope_N_mm, drift_N_mm)
+    return Free(start, level_N, settled_N, slope_N_mm, drift_N_mm, float(u[start]))
 
 
 def _followed(f: Reals, noise_N: float, slow_ratio: float) -> tuple[int, float, float] | str:
@@ -73,16 +80,41 @@ def _followed(f: Reals, noise_N: float, slow_ratio: float) -> tuple[int, float, 
     start = 0
     for _ in range(3):
         band = BAND_SIGMA * noise_N / np.sqrt(WIDTH) + BAND_FRAC * (top_N - level_N)
-        over = np.flatnonzero(means - level_N > band)
-        if not len(over):
+        risen = means - level_N > band
+        sure = means - level_N > max(band, SURE_FRAC * (float(means.max()) - level_N))
+        if not risen.any() or not sure.any():
             return "the force never rises steadily"
-        start = int(over[0])
+        free = np.flatnonzero(~risen[: int(np.argmax(sure))])  # what rises and comes back was no contact
+        start = int(free[-1]) + 1 if len(free) else 0
         if start < FREE_MIN // 3:
             break
         level_N = float(np.median(f[:start]))
         if start >= SURE_COUNT:
             noise_N = max(slow_ratio * float(np.std(np.diff(f[:start])) / np.sqrt(2)), LEAST_N)
+    if start >= SURE_COUNT and (waves_N := _waves_N(f[: 4 * start // 5])) > SLOW_RATIO * noise_N:
+        noise_N = waves_N
     return start, level_N, noise_N
+
+
+def _comes_back(f: Reals, found: tuple[int, float, float] | str) -> bool:
+    """Tell whether the force falls below where it seemed to rise: a wave, half of which was taken for drift.
+
+    Asked of the force as it is, up to where the specimen is met for sure.
+    """
+    if isinstance(found, str) or found[0] < WIDTH:
+        return False
+    means, start = _means(f), found[0]
+    before_N = float(np.median(f[start - WIDTH : start]))
+    sure = int(np.argmax(means > before_N + SURE_FRAC * (float(means.max()) - before_N)))
+    return bool(np.any(means[start:sure] < before_N))
+
+
+def _waves_N(free_N: Reals) -> float:
+    """Return the noise of a free part as its means of some samples show it, a parabola taken off: draughts, steps."""
+    means = _means(free_N)
+    x = np.linspace(-1, 1, len(means))
+    off = means - np.polynomial.polynomial.polyval(x, np.polynomial.polynomial.polyfit(x, means, 2))
+    return float(np.sqrt(WIDTH) * np.std(off))
 
 
 def _few(u: Reals, f: Reals, start: int) -> str | None:
@@ -151,6 +183,24 @@ def _steepest(u: Reals, f: Reals, start: int) -> float:
 
 def _means(f: Reals) -> Reals:
     return np.convolve(f, np.full(WIDTH, 1 / WIDTH), "valid")
+
+
+def without_spikes(f: Reals, noise_N: float) -> tuple[Reals, int]:
+    """Return the forces without single samples that stand out on both sides, and how many they were.
+
+    Each is held against the lines through the two samples before it and the two after it: a snap or a cusp goes on from
+    one of them. In its place comes the mean of its neighbours.
+    """
+    if len(f) < 5:
+        return f, 0
+    before, after = f[2:-2] - (2 * f[1:-3] - f[:-4]), f[2:-2] - (2 * f[3:-1] - f[4:])
+    stands_out = np.minimum(np.abs(before), np.abs(after)) > SPIKE_SIGMA * noise_N
+    at = np.flatnonzero(stands_out & (before * after > 0)) + 2
+    at = at[np.abs(f[at] - (f[at - 1] + f[at + 1]) / 2) > SPIKE_SIGMA * noise_N]
+    at = at[np.flatnonzero(np.diff(at, prepend=-9) > 2)]
+    clean = f.copy()
+    clean[at] = (f[at - 1] + f[at + 1]) / 2
+    return clean, len(at)
 
 
 def noise_of_N(u: Reals, f: Reals) -> tuple[float, float]:

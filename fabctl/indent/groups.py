@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fabctl.errors import RecordError, UsageError
+from fabctl.events import Emit, Event, silent
 from fabctl.indent.analysis import Numbered, analyse, conditioning_curves, read_samples, summarise_run
 from fabctl.indent.compare import Ratio, bca, describe, fieller
 from fabctl.indent.plot import draw_curves
@@ -23,7 +24,8 @@ def find_runs(lab: Workspace, name: str) -> list[RunFolder]:
     """Return the runs a word means: a run, or all tests of a specimen that hold samples."""
     if not SPECIMEN.fullmatch(name):
         return [lab.run(name)]
-    found = [run for run in lab.runs_of(name, "indent") if (run.path / "samples.csv").is_file()]
+    tests = lab.runs_of(name, "indent")
+    found = [run for run in tests if (run.path / "samples.csv").is_file() and status_of(run) != "refused"]
     if not found:
         raise UsageError(f"{name} has no test yet; `fabctl indent run {name}` makes one")
     return found
@@ -40,12 +42,14 @@ def parse_groups(lab: Workspace, runs: Sequence[str], groups: Sequence[str]) -> 
     return named
 
 
-def analyse_groups(named: Mapping[str, Sequence[RunFolder]], picture: Path | None = None) -> dict[str, Any]:
+def analyse_groups(
+    named: Mapping[str, Sequence[RunFolder]], picture: Path | None = None, emit: Emit = silent
+) -> dict[str, Any]:
     """Return every run's figures, every group's spread, and the ratio of each group to the last."""
     body: dict[str, Any] = {"groups": {}, "ratios": []}
     values: dict[str, dict[str, list[float]]] = {}
     for name, runs in named.items():
-        results = [_renewed(run) for run in runs]
+        results = [_renewed(run, emit) for run in runs]
         values[name] = _by_specimen(runs, results)
         entries = [
             {"run": run.run_id, "status": status_of(run), "result": result}
@@ -61,8 +65,9 @@ def analyse_groups(named: Mapping[str, Sequence[RunFolder]], picture: Path | Non
     return body
 
 
-def _renewed(run: RunFolder) -> dict[str, Any]:
+def _renewed(run: RunFolder, emit: Emit) -> dict[str, Any]:
     """Analyse a run anew; what a finished run noted beside its figures is kept."""
+    emit(Event("stage", f"analysing {run.run_id}"))
     body = {**(run.result() or {}), **summarise_run(run)}
     if run.outcome() is not None:
         run.write_result(body)

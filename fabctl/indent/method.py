@@ -214,6 +214,9 @@ def check(
     deepest_mm = max((a.depth_mm for a in plan if a.depth_mm is not None), default=0.0)
     if deepest_mm > method.limits.travel_mm:
         found.append(_beyond("METHOD-DEPTH", "the greatest depth", deepest_mm, method))
+    clearance_mm = max((a.clearance_mm for a in plan), default=0.0)
+    if clearance_mm > method.limits.travel_mm:
+        found.append(_beyond("METHOD-CLEARANCE", "the clearance of the approach", clearance_mm, method))
     if any(action.kind == "travel" for action in plan) and not has_stage:
         found.append(Finding("METHOD-STAGE", "the method has a grid, and this rig's map has no stage to move"))
     for action in plan:
@@ -228,7 +231,11 @@ def check(
                     limit=method.limits.force_N,
                 )
             )
-    deepest = max((a.depth_mm for a in plan if a.kind == "load" and a.depth_mm is not None), default=None)
+    loads = [a for a in plan if a.kind == "load"]
+    deepest = max((a.depth_mm for a in loads if a.depth_mm is not None), default=None)
+    if deepest is not None and deepest <= method.secant_mm and all(a.force_N is None for a in loads):
+        text = f"the secant is to {method.secant_mm:g} mm, the method loads to {deepest:g} mm: it will not be found"
+        found.append(Finding("METHOD-SECANT", text, "warning", hint="load deeper, or give a smaller secant_mm"))
     if predicted is None:
         found.append(Finding("METHOD-NO-PREDICTION", "no predicted response to check the method against", "warning"))
     else:

@@ -7,6 +7,9 @@ import json
 from collections.abc import Iterable, Sequence
 
 from design.findings import Finding
+from drivers.rig.indenter import Identity
+from fabctl.bench import begun_elsewhere
+from fabctl.config.bench import BenchConfig
 from fabctl.config.method import MethodConfig
 from fabctl.indent.method import Action
 from fabctl.records.folder import RunFolder
@@ -53,15 +56,25 @@ def _told(run: RunFolder, kind: str) -> list[dict[str, int]]:
     return found
 
 
-def against_resuming(run: RunFolder, specimen: str, method: MethodConfig) -> list[Finding]:
-    """Return what speaks against going on with `run`."""
+def against_resuming(run: RunFolder, specimen: str, method: MethodConfig, bench: BenchConfig) -> list[Finding]:
+    """Return what speaks against going on with `run`, as far as it is known before the rig is asked."""
     manifest = run.manifest()
-    found = []
     if manifest.get("kind") != "indent" or manifest.get("specimen") != specimen:
-        found.append(Finding("RESUME-OTHER", f"{run.run_id} is not a test of {specimen}"))
+        return [Finding("RESUME-OTHER", f"{run.run_id} is not a test of {specimen}")]
+    found = begun_elsewhere(run, bench)
     if manifest.get("config", {}).get("method") != method.model_dump(mode="json"):
         found.append(Finding("RESUME-METHOD", "the method has changed since", hint="run it from the beginning"))
     outcome = run.outcome()
     if outcome is not None and outcome["status"] == "done":
         found.append(Finding("RESUME-DONE", f"{run.run_id} came to its end"))
     return found
+
+
+def on_another_rig(run: RunFolder, identity: Identity) -> list[Finding]:
+    """Return what speaks against going on with `run` on the rig that answers: that it was begun on another one."""
+    before = run.manifest().get("config", {}).get("rig") or {}
+    there, here = (before.get("model"), before.get("serial")), (identity.model, identity.serial)
+    if there in ((None, None), here):
+        return []
+    text = f"{run.run_id} was begun on {there[0]} no. {there[1]}, here answers {here[0]} no. {here[1]}"
+    return [Finding("RESUME-RIG", text, hint="go on with that rig, or run it from the beginning")]

@@ -15,7 +15,7 @@ import numpy as np
 from design.findings import Finding
 from drivers.clock import Clock
 from drivers.errors import DeviceError
-from drivers.rig.indenter import Indenter, Limits, ended
+from drivers.rig.indenter import Indenter, Limits
 from drivers.rig.samples import Sample
 from fabctl.config.method import MethodConfig
 from fabctl.errors import FabctlError, RefusedError
@@ -23,6 +23,7 @@ from fabctl.events import Emit, Event, silent
 from fabctl.indent.contact import first_touch
 from fabctl.indent.method import Action, times_s
 from fabctl.indent.sampling import Keeper, Sampler, TimeLeft, Wish
+from fabctl.records.ending import undisturbed
 
 HOMING_MM_S = 8.0
 STANDING_MM = 1.0  # the safe heights of two methods differ by less; a pressed specimen is farther down
@@ -149,8 +150,9 @@ class Runner:
     def _leave(self) -> None:
         """Stop and disarm, whatever happened; the controller's watchdog stands behind this."""
         try:
-            stopped = self.rig.stop()
-            self.rig.disarm()
+            with undisturbed():  # another Ctrl-C between the two would leave the stage armed
+                stopped = self.rig.stop()
+                self.rig.disarm()
         except DeviceError as fault:
             stopped = False
             self.emit(Event("warning", f"rig: {fault}"))
@@ -325,7 +327,7 @@ class Runner:
         """Sample until a command is over and the stage stands; None where the operator paused it."""
         while True:
             found = self.sampler.fresh()
-            if ended(found, number) and found.state != "moving":
+            if self.rig.ended(found, number) and found.state != "moving":
                 return found
             if self.wish() == "pause":
                 self._pause()

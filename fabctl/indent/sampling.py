@@ -7,7 +7,8 @@ from typing import Literal, Protocol
 
 from drivers.clock import Clock
 from drivers.errors import DeviceRefused, DeviceTimeout
-from drivers.rig.indenter import LOST, Indenter, RigFaulted
+from drivers.rig.indenter import LOST, Indenter
+from drivers.rig.refusals import RigFaulted
 from drivers.rig.samples import Restarted, Sample
 from fabctl.errors import Stopped
 from fabctl.events import Emit, Event

@@ -12,7 +12,6 @@ import json
 import os
 import platform
 import secrets
-import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,6 +21,7 @@ from typing import IO, Any
 
 from fabctl.errors import RecordError
 from fabctl.events import Event
+from fabctl.records.ending import undisturbed
 
 FORMAT = 1
 LIBRARIES = ("numpy", "scipy", "libigl", "pyserial", "pymodbus", "opencv-contrib-python-headless", "open3d", "ezdxf")
@@ -160,11 +160,8 @@ class RunFolder:
     def finish(self, status: str, message: str = "", **details: Any) -> None:
         """Close the run: `status` is done, stopped, failed or refused. An interrupt meanwhile comes afterwards."""
         body = {"status": status, "message": message, "finished_utc": _utc().isoformat(), **details}
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-        try:
+        with undisturbed():
             write_atomically(self.path / "outcome.json", as_json(body))
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def start_run(
@@ -208,7 +205,8 @@ def open_run(path: Path) -> RunFolder:
     """Return an existing run; raise `RecordError` where there is none or it is half written."""
     if not (path / "manifest.json").is_file():
         raise RecordError(f"{path}: no run here (manifest.json is missing)")
-    _read(path / "manifest.json")
+    if "started_utc" not in _read(path / "manifest.json"):
+        raise RecordError(f"{path}: no run here (its manifest.json is not that of a run)")
     return RunFolder(path)
 
 

@@ -9,17 +9,18 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from fabctl.errors import RecordError
 from fabctl.records.folder import open_run, status_of
+from fabctl.records.words import is_simulated, result_words
 
 SCHEMA = """
-create table if not exists runs (
+create table if not exists listed (
   run text primary key, stamp_ns integer not null, kind text, specimen text, started_utc text,
-  status text not null, message text not null, operator text
+  status text not null, message text not null, operator text, simulated integer
 )
 """
 OPEN = ("running", "interrupted", "broken")  # states that may change without a file of the folder changing
@@ -36,6 +37,7 @@ class Row:
     status: str
     message: str
     operator: str | None
+    simulated: bool | None  # None: it needed no bench
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as plain JSON."""
@@ -73,32 +75,38 @@ def _rows(runs: Path, path: Path) -> list[Row]:
     with closing(sqlite3.connect(path, timeout=10)) as base, base:
         base.execute(SCHEMA)
         known = {
-            name: (stamp, status) for name, stamp, status in base.execute("select run, stamp_ns, status from runs")
+            name: (stamp, status) for name, stamp, status in base.execute("select run, stamp_ns, status from listed")
         }
-        base.executemany("delete from runs where run = ?", [(name,) for name in known if name not in folders])
+        base.executemany("delete from listed where run = ?", [(name,) for name in known if name not in folders])
         for name, folder in folders.items():
             stamp = _stamp_ns(folder)
             seen, status = known.get(name, (None, "broken"))
             if seen == stamp and status not in OPEN:
                 continue
             row = _read(folder)
-            values = (row.run, stamp, row.kind, row.specimen, row.started_utc, row.status, row.message, row.operator)
-            base.execute("insert or replace into runs values (?, ?, ?, ?, ?, ?, ?, ?)", values)
-        query = "select run, kind, specimen, started_utc, status, message, operator from runs order by run"
-        return [Row(*found) for found in base.execute(query)]
+            told = (row.kind, row.specimen, row.started_utc, row.status, row.message, row.operator, row.simulated)
+            base.execute("insert or replace into listed values (?, ?, ?, ?, ?, ?, ?, ?, ?)", (row.run, stamp, *told))
+        query = "select run, kind, specimen, started_utc, status, message, operator, simulated from listed order by run"
+        return [replace(row, simulated=_flag(row.simulated)) for row in (Row(*found) for found in base.execute(query))]
+
+
+def _flag(stored: int | None) -> bool | None:
+    """Return what SQLite keeps as a number."""
+    return None if stored is None else bool(stored)
 
 
 def _read(folder: Path) -> Row:
     try:
         run = open_run(folder)
         manifest, outcome, status = run.manifest(), run.outcome(), status_of(run)
+        message = str((outcome or {}).get("message", "")) or (result_words(run.result() or {}) if outcome else "")
+        simulated = is_simulated(manifest)
     except (RecordError, KeyError, ValueError, TypeError) as fault:
         why = str(fault) if isinstance(fault, RecordError) else f"{folder}: not a whole record: {fault!r}"
-        return Row(folder.name, None, None, None, "broken", why, None)
-    message = str((outcome or {}).get("message", ""))
+        return Row(folder.name, None, None, None, "broken", why, None, None)
     texts = [manifest.get(key) for key in ("kind", "specimen", "started_utc")]
     kind, specimen, started = (None if text is None else str(text) for text in texts)
-    return Row(folder.name, kind, specimen, started, status, message, str(manifest.get("operator")))
+    return Row(folder.name, kind, specimen, started, status, message, str(manifest.get("operator")), simulated)
 
 
 def _stamp_ns(folder: Path) -> int:

@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from fabctl.records.folder import RunFolder, status_of
 from fabctl.reports.indent_step import as_svg
 from fabctl.reports.model import Fact, Figure, Step, Word
-
-
-def is_coupon(design: Path) -> bool:
-    """Say whether a specimen's design folder is a coupon's."""
-    manifest = design / "manifest.json"
-    return manifest.is_file() and json.loads(manifest.read_text(encoding="utf-8")).get("kind") == "coupon"
+from fabctl.reports.numbers import with_half
 
 
 def coupon_step(run: RunFolder) -> Step:
@@ -31,9 +24,9 @@ def coupon_step(run: RunFolder) -> Step:
 
 
 def _fact(patch: Mapping[str, Any]) -> Fact:
-    value = f"{patch['expansion_ratio']:.4f} ± {patch['uncertainty_ratio']:.4f}"
+    value = with_half(patch["expansion_ratio"], patch["uncertainty_ratio"])
     expected, off = patch["expected_ratio"], patch["off_ratio"]
-    told = "the map: springs back" if expected is None else f"the map {expected:.4f}, off {off:+.4f}"
+    told = "the map: springs back" if expected is None else f"the map says {expected:.4f}: {off:+.4f} off"
     torn = patch["failed_at_count"]
     ended = (
         f"torn at cycle {torn} of {patch['cycles_count']}" if torn is not None else f"{patch['cycles_count']} cycles"
@@ -48,7 +41,7 @@ def coupon_verdict(run: RunFolder | None, cut: RunFolder | None) -> tuple[Word, 
         unread = ["coupon: its form is not read yet (fabctl design coupon-read)"] if run is None else []
         return "incomplete", "Not every step has a result.", missing + unread
     result = run.result() or {}
-    off = [patch for patch in result["patches"] if patch["agrees"] is False]
+    off = [patch for patch in result["patches"] if not patch["agrees"]]
     reasons = [
         f"patch {p['patch']}, hinge {p['hinge_mm']:.3f} mm: {p['off_ratio']:+.4f} off the map, more than its "
         f"uncertainty of {p['uncertainty_ratio']:.4f}"

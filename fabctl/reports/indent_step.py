@@ -13,7 +13,9 @@ from typing import Any, Literal
 from fabctl.indent.calibration import Calibration
 from fabctl.indent.method import read_predicted
 from fabctl.records.folder import RunFolder, status_of
+from fabctl.records.words import is_simulated
 from fabctl.reports.model import Fact, Figure, Step
+from fabctl.reports.numbers import COVERAGE, named, percent, plain, with_half
 
 FIGURES = (
     ("stiffness_secant_N_mm", "secant stiffness", "N/mm"),
@@ -42,9 +44,12 @@ def indent_step(run: RunFolder, design: Path) -> Step:
     notes = tuple(f"{f['level']}: {f['message']}" for f in result.get("findings", []))
     if outcome.get("status") != "done" and outcome.get("message"):
         notes = (str(outcome["message"]), *notes)
+    if outcome.get("status") == "done" and "curves" not in result:
+        notes = (f"recorded, its figures are not computed: fabctl indent analyse {run.run_id}", *notes)
     return Step(
-        "Indentation", status_of(run), summary, tuple(_facts(result, config, _started(manifest))), figures, notes
-    )
+        "Indentation", status_of(run), summary, tuple(_facts(result, config, _started(manifest))), figures, notes,
+        bool(is_simulated(manifest)),
+    )  # fmt: skip
 
 
 def _facts(result: Mapping[str, Any], config: Mapping[str, Any], started: datetime | None) -> list[Fact]:
@@ -56,20 +61,26 @@ def _facts(result: Mapping[str, Any], config: Mapping[str, Any], started: dateti
             found += [Fact(label, "not found", reason)] if reason else []
             continue
         spread = result.get(key.replace("_N_mm", "_ci95_N_mm")) if key.endswith("_N_mm") else None
-        found.append(Fact(label, f"{value:.4g} {unit}".strip(), f"± {spread:.2g} (95 %)" if spread else ""))
+        if unit == "":
+            found.append(Fact(label, percent(value)))
+        else:
+            found.append(Fact(label, with_half(value, spread, unit), "95 % interval" if spread else ""))
     foreseen = result.get("predicted_secant_N_mm")
     if foreseen is not None:
         measured = result.get("stiffness_secant_N_mm")
         note = f"measured / predicted = {measured / foreseen:.2f}" if measured and foreseen else ""
-        found.append(Fact("predicted secant stiffness", f"{foreseen:.4g} N/mm", note))
+        found.append(Fact("predicted secant stiffness", plain(foreseen, "N/mm"), note))
     rig = config.get("rig", {})
     found.append(
-        Fact("rig", f"{rig.get('model', '?')} no. {rig.get('serial', '?')}", f"at {config.get('sample_hz')} Hz")
+        Fact(
+            "rig",
+            f"{rig.get('model', '?')} no. {rig.get('serial', '?')}",
+            f"{config.get('sample_hz', '?')} samples a second",
+        )
     )
     found += _calibration_facts(config.get("calibration"), started)
     for name, value in (config.get("conditions") or {}).items():
-        label, _, unit = str(name).rpartition("_")
-        found.append(Fact(label or str(name), f"{value:.4g} {unit}" if isinstance(value, float) else f"{value} {unit}"))
+        found.append(Fact(*named(str(name), value)))
     return found
 
 
@@ -87,7 +98,7 @@ def _calibration_facts(known: Mapping[str, Any] | None, started: datetime | None
     calibration = Calibration(**known)
     pairs: tuple[tuple[str, Literal["force", "frame"], float | None, float | None, str], ...] = (
         ("load cell's gain", "force", calibration.gain_ratio, calibration.gain_se_ratio, ""),
-        ("frame's give", "frame", calibration.compliance_mm_N, calibration.compliance_se_mm_N, " mm/N"),
+        ("frame's give", "frame", calibration.compliance_mm_N, calibration.compliance_se_mm_N, "mm/N"),
     )
     found = []
     for label, word, value, se, unit in pairs:
@@ -97,7 +108,7 @@ def _calibration_facts(known: Mapping[str, Any] | None, started: datetime | None
             continue
         past = started is not None and started > ends
         note = f"PAST ITS DATE: ended on {ends.date()}" if past else f"valid to {ends.date()}"
-        found.append(Fact(label, f"{value:.5g} ± {2 * (se or 0.0):.2g}{unit}", note))
+        found.append(Fact(label, with_half(value, COVERAGE * (se or 0.0), unit), note))
     return found
 
 

@@ -39,6 +39,7 @@ class Step:
     facts: tuple[Fact, ...] = ()
     figures: tuple[Figure, ...] = ()
     notes: tuple[str, ...] = ()
+    simulated: bool = False  # no real device did it
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ class Report:
     steps: tuple[Step, ...]
     provenance: tuple[Provenance, ...]
     versions: tuple[Fact, ...]
-    made_utc: str
+    made: str  # when, on the clock of whoever made it
     head: str = ""  # scripts that live views share, once a page
 
 

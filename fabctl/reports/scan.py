@@ -11,7 +11,9 @@ import numpy as np
 
 from design.surface import TriMesh
 from fabctl.records.folder import RunFolder, status_of
+from fabctl.records.words import is_simulated
 from fabctl.reports.model import Fact, Figure, Provenance, Report, Step, Word, picture
+from fabctl.reports.numbers import COVERAGE, clock, named, percent, with_half
 from fabctl.reports.view3d import script, view
 
 TITLE = "Scan against target"
@@ -28,12 +30,12 @@ STATUS = {
 def scan_step(run: RunFolder) -> Step:
     """Return the deviation part of a page: numbers, the view that turns, pictures, histogram."""
     body = run.result() or {}
-    found = body.get("deviation")
+    found, made_up = body.get("deviation"), bool(is_simulated(run.manifest()))
     if found is None:
-        return Step(TITLE, status_of(run), sentence_of(body), (), _cleaning(run), _notes(body))
+        return Step(TITLE, status_of(run), sentence_of(body), (), _cleaning(run), _notes(body), made_up)
     figures = [_view(run, body, f"deviation-{run.run_id}")]
     figures += _pictures(run)
-    return Step(TITLE, status_of(run), sentence_of(body), deviation_facts(body), tuple(figures), _notes(body))
+    return Step(TITLE, status_of(run), sentence_of(body), deviation_facts(body), tuple(figures), _notes(body), made_up)
 
 
 def sentence_of(body: dict[str, Any]) -> str:
@@ -43,12 +45,12 @@ def sentence_of(body: dict[str, Any]) -> str:
         faults = [f["message"] for f in body.get("findings", []) if f["level"] == "error"]
         return "; ".join(faults) or "the comparison came to no result"
     text = (
-        f"The scan is {found['rms_mm']:.2f} mm rms ({found['rms_frac']:.2%} of the diagonal) off its target; "
+        f"The scan is {found['rms_mm']:.2f} mm RMS ({percent(found['rms_frac'], 2)} of the diagonal) off its target; "
         f"95 % of the seen area lies within {found['p95_abs_mm']:.2f} mm."
     )
     model = body.get("against_predicted")
     if model:
-        text += f" Against the predicted shape it is {model['rms_mm']:.2f} mm ({model['rms_frac']:.2%})."
+        text += f" Against the predicted shape it is {model['rms_mm']:.2f} mm ({percent(model['rms_frac'], 2)})."
     return text
 
 
@@ -63,8 +65,8 @@ def scan_report(run: RunFolder) -> Report:
     if tolerance is not None and found is not None:
         share = body["within_tolerance_frac"]
         reasons.append(
-            f"{share:.1%} of the compared area is within ±{tolerance:.2%} of the diagonal; "
-            f"{body['share_within_required_frac']:.0%} is asked"
+            f"{percent(share)} of the compared area is within ± {percent(tolerance, 2)} of the diagonal; "
+            f"{percent(body['share_within_required_frac'], 0)} is asked"
         )
     elif found is not None:
         reasons.append("no tolerance was given, so nothing is passed or failed")
@@ -80,7 +82,7 @@ def scan_report(run: RunFolder) -> Report:
         steps=tuple(steps),
         provenance=tuple(_provenance(run, manifest)),
         versions=tuple(Fact(k, str(v)) for k, v in manifest.get("versions", {}).items()),
-        made_utc=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        made=clock(datetime.now(UTC).isoformat()),
         head=script() if found is not None else "",
     )
 
@@ -94,46 +96,48 @@ def write_scan_report(run: RunFolder) -> Path:
     return path
 
 
-def _mm(value: float, diagonal_mm: float, sign: str = "") -> str:
-    return f"{value:{sign}.3f} mm = {value / diagonal_mm:{sign}.3%}"
+def _half(body: dict[str, Any], key: str) -> float | None:
+    """Return the half interval of a figure, about 95 %, from its standard deviation."""
+    sigma = (body.get("uncertainty") or {}).get(key)
+    return None if sigma is None else COVERAGE * float(sigma)
 
 
 def deviation_facts(body: dict[str, Any]) -> tuple[Fact, ...]:
-    """Return the table of a comparison."""
-    found, spread = body["deviation"], body.get("uncertainty") or {}
+    """Return the table of a comparison; what has an uncertainty of its own is written to its digits."""
+    found = body["deviation"]
     size = found["diagonal_mm"]
     place = ", ".join(f"{x:.1f}" for x in found["max_place_mm"])
 
-    def sigma(key: str) -> str:
-        return f"± {spread[key]:.3f} mm" if spread.get(key) is not None else ""
+    def length(label: str, value_mm: float, note: str = "", sign: str = "", half: float | None = None) -> Fact:
+        told = with_half(value_mm, half, "mm", sign) if half else f"{value_mm:{sign}.2f} mm"
+        of_it = f"{percent(value_mm / size, 2, sign)} of the diagonal"
+        return Fact(label, told, "; ".join(filter(None, (of_it, note, "95 % interval" if half else ""))))
 
     rows = [
-        Fact("mean", _mm(found["mean_mm"], size, "+"), sigma("mean_mm")),
-        Fact("mean absolute", _mm(found["mean_abs_mm"], size)),
-        Fact("rms", _mm(found["rms_mm"], size), sigma("rms_mm")),
-        Fact("standard deviation", _mm(found["sigma_mm"], size)),
+        length("mean", found["mean_mm"], "", "+", _half(body, "mean_mm")),
+        length("mean absolute", found["mean_abs_mm"]),
+        length("RMS", found["rms_mm"], "", "", _half(body, "rms_mm")),
+        length("standard deviation", found["sigma_mm"]),
         *(
-            Fact(f"{int(k[1:])} % of the area below", _mm(v, size, "+"))
+            length(f"{int(k[1:])} % of the area below", v, "", "+")
             for k, v in found["percentiles_mm"].items()
             if k in ("p01", "p05", "p50", "p95", "p99")
         ),
-        Fact("largest patch mean", _mm(found["max_patch_mm"], size, "+"), "over an even patch"),
-        Fact("largest single point", _mm(found["max_mm"], size, "+"), f"at ({place}) mm"),
-        *(Fact(f"within ±{float(k):.2%}", f"{v:.1%} of the area") for k, v in found["within_frac"].items()),
-        Fact("target seen", f"{found['coverage_frac']:.1%} of its area"),
+        length("largest patch mean", found["max_patch_mm"], "over an even patch", "+"),
+        length("largest single point", found["max_mm"], f"at ({place}) mm", "+"),
+        *(
+            Fact(f"area within ± {percent(float(k), 2)} of the diagonal", percent(v))
+            for k, v in found["within_frac"].items()
+        ),
+        Fact("target seen", percent(found["coverage_frac"]), "of its area"),
         Fact("points compared", f"{found['points_count']:,}"),
         Fact("left out", f"{found['border_count']:,} past the border, {found['lone_count']:,} wrong matches"),
         Fact("bounding-box diagonal", f"{size:.2f} mm"),
     ]
     model = body.get("against_predicted")
     if model:
-        rows.append(
-            Fact(
-                "against the predicted shape",
-                _mm(model["rms_mm"], size) + " rms",
-                f"the prediction explains {model['known_frac']:.0%} of the mean square deviation",
-            )
-        )
+        said = f"RMS; the prediction explains {percent(model['known_frac'], 0)} of the mean square deviation"
+        rows.append(length("against the predicted shape", model["rms_mm"], said))
     return tuple(rows)
 
 
@@ -141,13 +145,17 @@ def _key_facts(body: dict[str, Any]) -> tuple[Fact, ...]:
     found = body.get("deviation")
     if found is None:
         return ()
-    return (
-        Fact("rms", f"{found['rms_mm']:.3f} mm", f"{found['rms_frac']:.3%} of the diagonal"),
-        Fact("mean absolute", f"{found['mean_abs_mm']:.3f} mm", f"{found['mean_abs_frac']:.3%}"),
-        Fact("95 % within", f"{found['p95_abs_mm']:.3f} mm", f"{found['p95_abs_frac']:.3%}"),
-        Fact("largest patch", f"{found['max_patch_mm']:+.3f} mm", f"{found['max_patch_frac']:+.3%}"),
-        Fact("seen", f"{found['coverage_frac']:.0%}", "of the target's area"),
+    rows = (
+        ("RMS", "rms", ""),
+        ("mean absolute", "mean_abs", ""),
+        ("95 % within", "p95_abs", ""),
+        ("largest patch", "max_patch", "+"),
     )
+    told = [
+        Fact(label, f"{found[f'{key}_mm']:{sign}.2f} mm", f"{percent(found[f'{key}_frac'], 2, sign)} of the diagonal")
+        for label, key, sign in rows
+    ]
+    return (*told, Fact("seen", percent(found["coverage_frac"], 0), "of the target's area"))
 
 
 def _view(run: RunFolder, body: dict[str, Any], ident: str) -> Figure:
@@ -161,11 +169,15 @@ def _view(run: RunFolder, body: dict[str, Any], ident: str) -> Figure:
 def _pictures(run: RunFolder) -> list[Figure]:
     folder = run.path / "artefacts"
     names = (
-        ("map-oblique.png", "from obliquely above", False),
-        ("map-top.png", "from above", False),
-        ("map-front.png", "from the front", False),
-        ("histogram.svg", "share of the compared area by deviation; dashed: the tolerance", False),
-        ("bar.svg", "colours of map and histogram", True),
+        ("map-oblique.png", "The same from obliquely above.", False),
+        ("map-top.png", "The same from above.", False),
+        ("map-front.png", "The same from the front.", False),
+        (
+            "histogram.svg",
+            "Share of the compared area by deviation; dashed: the tolerance, where it is as near.",
+            False,
+        ),
+        ("bar.svg", "Colours of the map and the histogram, in mm and in percent of the diagonal.", True),
     )
     return [picture(folder / name, text, wide) for name, text, wide in names if (folder / name).is_file()]
 
@@ -180,7 +192,7 @@ def _cleaning_step(run: RunFolder, body: dict[str, Any]) -> Step:
     cloud = body["cloud"]
     total = max(cloud["points_count"], 1)
     facts = tuple(
-        Fact(name, f"{cloud[f'{name}_count']:,}", f"{cloud[f'{name}_count'] / total:.1%}")
+        Fact(name, f"{cloud[f'{name}_count']:,}", percent(cloud[f"{name}_count"] / total))
         for name in ("specimen", "table", "background", "stray")
     )
     said = f"{cloud['points_count']:,} points were read; the specimen is: {cloud['part']}."
@@ -192,22 +204,30 @@ def _alignment_step(body: dict[str, Any]) -> Step:
     if pose is None:
         return Step("Alignment", "failed", "There is no pose.")
     spread = body.get("uncertainty") or {}
-    scale_note = f"± {spread['scale_frac']:.4%}" if spread.get("scale_frac") is not None else ""
+    unit_mm, half = pose["unit_mm"], _half(body, "scale_frac")
     facts = [
         Fact("status", str(body["status"]), STATUS[str(body["status"])]),
         Fact("decided by", str(body["decided_by"])),
         Fact("mode", str(body.get("mode", "best-fit"))),
-        Fact("scale", f"{pose['unit_mm']:.6g} mm a cloud unit", scale_note),
-        Fact("misfit, both ways", f"{pose['misfit_frac']:.3%}", "of the diagonal"),
-        Fact("patches left out", f"{pose['patches_left_out_frac']:.1%}", "they deviate, and must not drag the fit"),
+        Fact(
+            "scale",
+            f"{with_half(unit_mm, half and half * unit_mm, 'mm')} a cloud unit",
+            "95 % interval" if half else "",
+        ),
+        Fact("misfit, both ways", percent(pose["misfit_frac"], 2), "of the diagonal"),
+        Fact("patches left out", percent(pose["patches_left_out_frac"]), "they deviate, and must not drag the fit"),
     ]
     if spread.get("motion_frac") is not None:
-        facts.append(Fact("pose uncertainty", f"{spread['motion_frac']:.4%}", "of the diagonal, by bootstrap"))
+        facts.append(
+            Fact(
+                "pose uncertainty", percent(COVERAGE * spread["motion_frac"], 2), "of the diagonal, 95 %, by bootstrap"
+            )
+        )
     rows: list[tuple[str, ...]] = [
-        (str(a["relation"]), f"{a['misfit_frac']:.3%}", f"{a['ratio']:.3f}", _rms_text(a.get("deviation_rms_mm")))
+        (str(a["relation"]), percent(a["misfit_frac"], 2), f"{a['ratio']:.3f}", _rms_text(a.get("deviation_rms_mm")))
         for a in body.get("alternatives", [])
     ]
-    table = _table(("other pose", "misfit", "to the best", "rms"), rows)
+    table = _table(("other pose", "misfit", "to the best", "RMS"), rows)
     figures = (Figure(table, "Every pose within 10 % of the best."),)
     symmetries = body["target"]["symmetries"] or ["none found"]
     notes = tuple(f"symmetry of the target: {line}" for line in symmetries)
@@ -216,7 +236,7 @@ def _alignment_step(body: dict[str, Any]) -> Step:
 
 
 def _rms_text(rms_mm: float | None) -> str:
-    return "" if rms_mm is None else f"{rms_mm:.3f} mm"
+    return "" if rms_mm is None else f"{rms_mm:.2f} mm"
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
@@ -237,6 +257,6 @@ def _provenance(run: RunFolder, manifest: dict[str, Any]) -> list[Provenance]:
         Provenance("input", Path(str(item["path"])).name, "", str(item["sha256"]), f"{item['bytes']:,} bytes")
         for item in manifest.get("inputs", [])
     ]
-    asked = ", ".join(f"{k}={v}" for k, v in manifest.get("config", {}).items() if v is not None)
-    detail = f"{asked}, seed={manifest.get('seed')}"
-    return [*rows, Provenance("run", run.run_id, str(manifest.get("started_utc", ""))[:19], "", detail)]
+    asked = {**manifest.get("config", {}), "seed": manifest.get("seed")}
+    detail = ", ".join(" ".join(named(key, value)) for key, value in asked.items() if value is not None)
+    return [*rows, Provenance("run", run.run_id, clock(str(manifest.get("started_utc", ""))), "", detail)]

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from fabctl.coupon import KIND as READING
 from fabctl.records.folder import RunFolder, sha256, status_of
-from fabctl.reports.coupon_step import coupon_step, coupon_verdict, is_coupon
+from fabctl.records.words import is_simulated
+from fabctl.reports.coupon_step import coupon_step, coupon_verdict
 from fabctl.reports.design_step import cut_step, design_step
 from fabctl.reports.indent_step import indent_step
 from fabctl.reports.model import Fact, Provenance, Report, Step, Word
+from fabctl.reports.numbers import clock, percent
 from fabctl.reports.scan import TITLE, scan_step
 from fabctl.reports.view3d import script
 from fabctl.workspace import Specimen, Workspace
+
+WITHIN = "area within ± 1.00 % of the diagonal"
 
 
 def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
@@ -26,9 +32,9 @@ def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
     steps += [cut_step(latest["cut"])] if "cut" in latest else []
     steps += [indent_step(latest["indent"], specimen.design)] if "indent" in latest else []
     steps += [scan_step(latest["scan"])] if "scan" in latest else []
-    steps += [coupon_step(latest["coupon"])] if "coupon" in latest else []
-    if is_coupon(specimen.design):
-        word, sentence, reasons = coupon_verdict(latest.get("coupon"), latest.get("cut"))
+    steps += [coupon_step(latest[READING])] if READING in latest else []
+    if specimen.is_coupon:
+        word, sentence, reasons = coupon_verdict(latest.get(READING), latest.get("cut"))
     else:
         word, sentence, reasons = verdict(latest)
     if made_up := simulated(latest):
@@ -37,7 +43,7 @@ def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
     name = _design_name(specimen)
     return Report(
         title=f"Specimen {specimen.name} · {name}",
-        subtitle=f"Made {str(record['made_utc'])[:16].replace('T', ' ')} UTC",
+        subtitle=f"Made {clock(str(record['made_utc']))}",
         word=word,
         sentence=sentence,
         reasons=tuple(reasons),
@@ -45,7 +51,7 @@ def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
         steps=tuple(steps),
         provenance=tuple(_provenance(specimen, runs)),
         versions=tuple(_versions(runs)),
-        made_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        made=clock(datetime.now(UTC).isoformat()),
         head=script() if "scan" in latest else "",
     )
 
@@ -76,11 +82,14 @@ def verdict(latest: dict[str, RunFolder]) -> tuple[Word, str, list[str]]:
     if missing or broken or deviation is None:
         reasons = [f"{kind}: not done yet" for kind in missing] + broken
         return "incomplete", "Not every step has a result.", reasons
-    size = f"RMS deviation {deviation['rms_mm']:.2f} mm, {deviation['rms_frac']:.2%} of the diagonal"
+    size = f"RMS deviation {deviation['rms_mm']:.2f} mm, {percent(deviation['rms_frac'], 2)} of the diagonal"
     tolerance = scan.get("tolerance_frac")
     if tolerance is None:
         return "incomplete", f"{size}; no tolerance was given to hold it against.", []
-    share = f"{scan['share_within_required_frac']:.0%} of the area must lie within {tolerance:.2%}"
+    asked = percent(scan["share_within_required_frac"], 0)
+    share = f"{asked} of the area must lie within ± {percent(tolerance, 2)} of the diagonal"
+    if (within := scan.get("within_tolerance_frac")) is not None:
+        share += f"; {percent(within)} does"
     if scan.get("verdict") == "pass":
         return "pass", f"{size}; within tolerance.", [share]
     if scan.get("verdict") == "fail":
@@ -90,35 +99,28 @@ def verdict(latest: dict[str, RunFolder]) -> tuple[Word, str, list[str]]:
 
 def simulated(latest: dict[str, RunFolder]) -> list[str]:
     """Return the kinds whose telling run was made on a simulated bench, in the order of the work."""
-    return [kind for kind in ("cut", "indent", "scan") if kind in latest and _on_simulators(latest[kind])]
-
-
-def _on_simulators(run: RunFolder) -> bool:
-    config = run.manifest().get("config", {})
-    bench = config.get("bench")
-    listed = isinstance(bench, dict) and (bench.get("simulated") or bench.get("simulators"))
-    return bool(config.get("simulated") or listed)
+    return [kind for kind in ("cut", "indent", "scan") if kind in latest and is_simulated(latest[kind].manifest())]
 
 
 def _keys(steps: Sequence[Step], latest: dict[str, RunFolder]) -> Iterator[Fact]:
     facts = {(step.title, fact.label): fact for step in steps for fact in step.facts}
     wanted = (
-        (TITLE, "rms"),
-        (TITLE, "within ±1.00%"),
-        ("Indentation", "secant stiffness"),
-        ("Indentation", "largest force"),
-        ("Design", "cells"),
+        (TITLE, "RMS", "RMS deviation"),
+        (TITLE, WITHIN, WITHIN),
+        ("Indentation", "secant stiffness", "secant stiffness"),
+        ("Indentation", "largest force", "largest force"),
+        ("Design", "cells", "cells"),
     )
-    yield from (facts[key] for key in wanted if key in facts)
+    yield from (replace(facts[title, label], label=told) for title, label, told in wanted if (title, label) in facts)
 
 
 def _provenance(specimen: Specimen, runs: Sequence[RunFolder]) -> Iterator[Provenance]:
-    when = str(specimen.record()["made_utc"])[:16]
+    when = clock(str(specimen.record()["made_utc"]))
     for path in sorted(p for p in specimen.design.iterdir() if p.is_file()):
         yield Provenance("design", path.name, when, sha256(path), "")
     for run in runs:
         manifest = run.manifest()
-        began = str(manifest["started_utc"])[:16]
+        began = clock(str(manifest["started_utc"]))
         kind, detail = str(manifest["kind"]), f"{status_of(run)}, {manifest['operator']}"
         yield Provenance(kind, run.run_id, began, sha256(run.path / "manifest.json"), detail)
         outside = [item for item in manifest["inputs"] if Path(item["path"]).parent != specimen.design]

@@ -154,7 +154,7 @@ def compare(request: Request, emit: Emit = silent) -> Comparison:
     if registration.status not in ("aligned", "symmetric") or registration.best is None:
         return replace(made, findings=tuple(findings))
     emit(Event("stage", "measuring deviations"))
-    return _measured(made, symmetries, findings)
+    return _measured(made, symmetries, findings, emit)
 
 
 def _by_mode(mode: Mode, task: Task, found: Registration) -> Registration:
@@ -211,13 +211,14 @@ def read_datums(request: Request) -> Datums | None:
     return Datums(labels, np.array([seen[k] for k in labels]), np.array([meant[k] for k in labels]))
 
 
-def _measured(made: Comparison, symmetries: Symmetries, findings: list[Finding]) -> Comparison:
+def _measured(made: Comparison, symmetries: Symmetries, findings: list[Finding], emit: Emit) -> Comparison:
     registration, target, request = made.registration, made.target, made.request
     best = registration.best
     assert best is not None
     points = made.cloud.points[registration.specimen]
     deviation = deviate(points, best.pose, target)
     numbers = statistics(deviation, target)
+    emit(Event("stage", "finding how sure they are"))
     spread = bootstrap(best.fit, target, request.seed, free_scale=made.scale is None, still=symmetries.still(target))
     some = points[:: max(1, len(points) // 60_000)]
     others = [statistics(deviate(some, a.pose, target), target) for a in registration.alternatives]

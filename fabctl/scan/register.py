@@ -117,7 +117,9 @@ def body_of(task: Task, part: Part) -> Body | None:
 def tried(task: Task, body: Body, start: Similarity, relation: str = "found by the search") -> Judged:
     """Return the pose refined from `start`, and judged."""
     fit = refine(body.even, start, task.target, task.options)
-    return judge(fit, body.even[:JUDGE_POINTS], body.dense, task.target, relation)
+    judged = judge(fit, body.even[:JUDGE_POINTS], body.dense, task.target, relation)
+    task.emit(Event("progress", f"a pose {relation}: misfit {judged.score_frac:.2%} of the diagonal"))
+    return judged
 
 
 def poses_of(task: Task, body: Body, *, mirrored: bool = False) -> list[Judged]:

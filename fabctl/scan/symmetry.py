@@ -81,7 +81,7 @@ class Symmetries:
         """Return every symmetry in words, with how exactly it holds."""
         lines = []
         if self.axis_direction is not None:
-            axis = ", ".join(f"{x:+.2f}" for x in self.axis_direction)
+            axis = ", ".join(f"{round(float(x), 2) + 0.0:.2f}" for x in self.axis_direction)  # no -0.00
             lines.append(f"any turn about ({axis}), to {self.axis_misfit_frac:.3%} of the diagonal")
         lines += [f"{s.describe()}, to {s.misfit_frac:.3%} of the diagonal" for s in self.turns]
         return lines

@@ -101,6 +101,17 @@ def test_without_homing_too_a_board_that_lived_goes_on_from_exactly_there(cut: C
 
 
 @unhomed
+@pytest.mark.parametrize("off_mm", [0.0, 0.5])
+def test_without_homing_only_a_head_where_it_was_left_is_believed(cut: Cut, off_mm: float) -> None:
+    x, y, z = cut.rig.board.machine.position_mm()
+    cut.run.finish("stopped", "by the operator", position_known=True, machine_mm=[x, y + off_mm, z])
+    if off_mm:
+        assert set(refusal(cut)) == {"RESUME-LOST"}
+    else:
+        assert cut.resume().result["position_kept"]
+
+
+@unhomed
 def test_without_homing_a_lost_zero_is_asked_for_and_framed(cut: Cut) -> None:
     zero, since = restart(cut.rig), len(cut.rig.trace)
     assert "--origin here" in refusal(cut)["RESUME-LOST"]

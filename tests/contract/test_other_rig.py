@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import DeviceRefused
-from drivers.rig.indenter import Indenter, Limits, RigFaulted
+from drivers.rig.indenter import Indenter, Limits
+from drivers.rig.refusals import RigFaulted
 from drivers.rig.registers import BadReply, RegisterMap, Table
 from drivers.rig.samples import Sample
 from fabctl.config.loader import parse
@@ -21,7 +22,7 @@ from simulators.rig.controller import TICK_S, Machine
 from simulators.rig.grams import Grams
 from simulators.specimens.analytic import linear
 from simulators.specimens.curve import Specimen
-from tests.rig_endpoints import simulated_rig
+from tests.rig_endpoints import rig_bench, short_method, simulated_rig
 
 MAP = (Path(__file__).resolve().parents[2] / "configs" / "rigs" / "grams.yaml").read_text()
 STATUS_AT, COMMAND_AT = 3000, 4000
@@ -115,22 +116,12 @@ def test_a_reading_outside_the_maps_limits_is_not_believed() -> None:
     assert rig.lost_count == before + 1
 
 
-METHOD = """name: short
-sample_hz: 50
-safe_height_mm: 0.5
-travel_speed_mm_s: 20
-acceleration_mm_s2: 200
-limits: {force_N: 4, tension_N: 1, travel_mm: 40, watchdog_s: 1.0}
-steps:
-  - {step: tare, time_s: 0.3}
-  - {step: approach, speed_mm_s: 6, trigger_N: 0.05, clearance_mm: 1.0}
-  - {step: preload, force_N: 0.03, speed_mm_s: 1}
-  - {step: zero}
-  - {step: cycles, cycles_count: 1, depth_mm: 2.8, speed_mm_s: 1, unload_speed_mm_s: 6}
-"""
-BENCH = """name: other
-rig: {url: "URL", map: grams, travel_mm: 60, force_limit_N: 20, indenter_radius_mm: 8}
-"""
+METHOD = short_method(
+    "step: approach, speed_mm_s: 6, trigger_N: 0.05, clearance_mm: 1.0",
+    "step: preload, force_N: 0.03, speed_mm_s: 1",
+    "step: zero",
+    "step: cycles, cycles_count: 1, depth_mm: 2.8, speed_mm_s: 1, unload_speed_mm_s: 6",
+).replace("sample_hz: 100", "sample_hz: 50")
 
 
 @pytest.mark.parametrize("line", ["tcp", "rtu"])
@@ -143,7 +134,7 @@ def test_another_rig_on_a_real_line_is_asked_tared_and_goes_through_a_whole_meth
     (tmp_path / "short.yaml").write_text(METHOD)
     with simulated_rig(*where, *options, "--compliance-mm-N", "0") as url:
         assert "unit=17" in url
-        (tmp_path / "other.yaml").write_text(BENCH.replace("URL", url))
+        (tmp_path / "other.yaml").write_text(rig_bench(url, "other", "grams"))
         bench = SimulatedBench(lab, {"rig": url})
         said = bench.fabctl("rig", "info", "--bench", "other.yaml")
         assert (said["model"], said["serial"]) == ("Gramometer", 1005)

@@ -13,9 +13,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from serial.serialutil import Timeout
 
 from drivers.errors import DeviceRefused, DeviceTimeout, ProtocolError, TransportError
-from drivers.rig.indenter import Indenter, Limits, RigFaulted, open_indenter
+from drivers.rig.indenter import Indenter, Limits, open_indenter
+from drivers.rig.refusals import RigFaulted
 from drivers.rig.samples import Sample
 from tests.rig_endpoints import ENDPOINTS, PATIENT, endpoint, free_port, simulated_rig
 
@@ -96,8 +98,8 @@ def test_the_emergency_stop_stops_the_stage_and_stays_until_it_is_released(tmp_p
         with pytest.raises(DeviceRefused, match="faulted"):
             rig.arm()
         (tmp_path / "estop").unlink()
-        time.sleep(0.3)
-        rig.clear_faults()
+        while "estop" in rig.fresh_sample().faults:  # until the simulator has looked
+            rig.clear_faults()
         rig.arm()
         assert rig.stop()
 
@@ -117,13 +119,14 @@ def test_a_host_held_up_while_it_writes_has_not_lost_its_line(tmp_path: Path, mo
         simulated_rig("--rtu", str(tmp_path / "rig"), "--specimen", "linear") as url,
         contextlib.closing(open_indenter(url, PATIENT)) as rig,
     ):
-        plain = os.write
+        plain, late_s = os.write, [0.0]
 
         def held_up(handle: int, data: bytes) -> int:
             written = plain(handle, data)
-            time.sleep(0.45)  # longer than the time for a reply
+            late_s[0] += 0.45  # longer than the time for a reply
             return written
 
+        monkeypatch.setattr(Timeout, "TIME", staticmethod(lambda: time.monotonic() + late_s[0]))
         monkeypatch.setattr(os, "write", held_up)
         with contextlib.suppress(DeviceTimeout, ProtocolError):
             rig.sample()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from matplotlib.axes import Axes
 
 from design.bundle import Bundle, open_bundle, write_coupon_bundle
 from design.cells.library import load_library
@@ -20,6 +21,7 @@ from design.job import compose_job
 from design.pattern.drawing import as_json, from_json
 from design.pattern.paths import LAYERS, LayerPreset
 from design.pattern.toolpath import ToolOptions, strokes_of
+from design.preview import coupon_png
 
 PRESETS = {layer: LayerPreset(0.5, 20.0) for layer in LAYERS}
 COLUMNS, ROWS = 3, 2
@@ -45,7 +47,7 @@ def test_a_coupon_is_uniform_but_for_its_hinges_and_wider_hinges_expand_less(mad
     outlines = [path.points_mm for path in made.drawing.paths if path.layer == "outline"]
     assert len(outlines) == 2
     assert np.ptp(outlines[0], axis=0) == pytest.approx(np.ptp(outlines[1], axis=0))
-    assert coupon_csv(made.patches).splitlines()[1].startswith("A,0.2500,1.5")
+    assert coupon_csv(made.patches).splitlines()[-2].startswith("A,0.2500,1.5")
     points = np.vstack([path.points_mm for path in made.drawing.paths])
     assert (points >= 0).all()
     assert (points <= made.drawing.size_mm).all()
@@ -57,6 +59,20 @@ def test_the_length_to_measure_lies_between_the_notches_of_both_borders(made: Co
     middle = np.unique(tiling.vertices_mm[:, 1].round(6))[1]  # the row of corners between the two rows of cells
     x = tiling.vertices_mm[np.isclose(tiling.vertices_mm[:, 1], middle), 0]
     assert np.ptp(x) == pytest.approx(made.patches[0].gauge_mm) == COLUMNS * 10
+    assert made.patches[0].notches_mm == pytest.approx(np.array([[x.min(), middle], [x.max(), middle]]))
+
+
+def test_the_picture_names_both_notches_of_every_patch(made: Coupon, monkeypatch: pytest.MonkeyPatch) -> None:
+    named: dict[str, tuple[float, float]] = {}
+
+    def note(_axes: Axes, text: str, xy: tuple[float, float], *_words: object, **_more: object) -> None:
+        named[text] = xy
+
+    monkeypatch.setattr(Axes, "annotate", note)
+    assert coupon_png(made).startswith(b"\x89PNG")
+    assert list(named) == ["A1", "A2", "B1", "B2"]
+    for patch in made.patches:
+        assert [named[f"{patch.label[0]}{k}"] for k in (1, 2)] == pytest.approx(patch.notches_mm)
 
 
 def test_every_patch_carries_its_letter_and_the_id_on_a_tag_of_its_own(made: Coupon) -> None:
@@ -99,3 +115,8 @@ def test_hinges_that_leave_no_slit_or_no_letter_are_refused(hinges: list[float])
     cell = select(load_library(), np.array([1.5]))
     with pytest.raises(DesignError):
         coupon(float(cell.t_mm[0]), float(cell.theta_rad[0]), hinges, Sheet(), (COLUMNS, ROWS))
+
+
+def test_a_sheet_that_there_is_not_is_told_with_those_there_are(folder: Bundle) -> None:
+    with pytest.raises(BundleError, match="there is no sheet 2; this coupon is one sheet"):
+        folder.drawing(2)

@@ -15,7 +15,9 @@ from click.testing import CliRunner, Result
 
 from design.cells.calibrate import calibrate
 from design.cells.library import load_library
+from design.cells.select import selection_curve
 from design.errors import DesignError
+from fabctl.cli.library_parts import CURVE_WHY
 from fabctl.cli.main import cli
 from fabctl.errors import ClusterAway, UsageError, WorkerDied
 
@@ -29,6 +31,17 @@ def test_show_tells_range_counts_and_reasons(tmp_path: Path) -> None:
     assert told["cells_count"] == len(load_library())
     assert sum(told["candidates"].values()) == 7552
     assert told["command"].startswith("fabctl library build")
+
+
+def test_both_ranges_are_told_with_why_they_differ_by_the_library_and_by_the_check(tmp_path: Path) -> None:
+    library = load_library()
+    whole, chosen = library.range_ratio(), selection_curve(library).range_ratio()
+    assert json.loads(run("show", "--json", home=tmp_path).stdout)["curve_range_ratio"] == list(chosen)
+    (line,) = [line for line in run("show", home=tmp_path).stdout.splitlines() if CURVE_WHY in line]
+    assert f"{chosen[0]:.4f} to {chosen[1]:.4f}" in line
+    check = CliRunner().invoke(cli, ["--home", str(tmp_path), "design", "check", "saddle"]).stdout.splitlines()[0]
+    assert f"has {chosen[0]:.3f} to {chosen[1]:.3f}" in check
+    assert f"(all its cells {whole[0]:.3f} to {whole[1]:.3f}: {CURVE_WHY})" in check
 
 
 def test_cell_gives_numbers_slits_and_a_picture(tmp_path: Path) -> None:

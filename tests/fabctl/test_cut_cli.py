@@ -25,15 +25,15 @@ SLITS = 20
 DUMMIES = ("target.ply", "flat.ply", "cells.csv", "cut.dxf", "cut.svg", "cut.nc", "deployed.ply", "response.csv")
 
 
-def make_design(path: Path, slits: int = SLITS) -> Path:
-    """Write a small design folder by hand: some slits, a border, no id."""
+def make_design(path: Path, slits: int = SLITS, id_anchor: dict[str, float] | None = None) -> Path:
+    """Write a small design folder by hand: some slits, a border, an id where it has an anchor."""
     path.mkdir()
     paths: list[dict[str, Any]] = [
         {"layer": "slit", "points_mm": [[10 + 2 * k, 10], [10 + 2 * k, 16]], "closed": False, "cell": k}
         for k in range(slits)
     ]
     border = {"layer": "outline", "points_mm": [[5, 5], [95, 5], [95, 25], [5, 25]], "closed": True, "cell": None}
-    drawing = {"format": 1, "sheet_mm": [100, 30], "id_anchor": None, "paths": [*paths, border]}
+    drawing = {"format": 1, "sheet_mm": [100, 30], "id_anchor": id_anchor, "paths": [*paths, border]}
     (path / "paths.json").write_text(json.dumps(drawing))
     (path / "spec.yaml").write_text("name: small\ntarget: cap.obj\nmaterial: natural-rubber-2.3\n")
     for name in DUMMIES:
@@ -114,6 +114,14 @@ def assert_dark(lab: Lab) -> None:
     assert before[-1][3] == 0
     for a, b in itertools.pairwise(before):
         assert not (a[3] > 0 and a[1:3] == b[1:3] and b[0] - a[0] > 0.02), "lit while standing"
+
+
+def test_what_is_told_before_a_cut_is_what_is_cut_with_its_id(lab: Lab, tmp_path: Path) -> None:
+    design = make_design(tmp_path / "design", 2, {"x_mm": 50.0, "y_mm": 20.0, "height_mm": 3.0, "width_mm": 30.0})
+    foretold, facts = (json.loads(lab.run(*lab.cut(design, *more))[1]) for more in (["--dry-run"], []))
+    assert facts["specimen"] == "S-0001"
+    for key in ("lines_count", "burnt_mm", "job_sha256"):
+        assert facts[key] == foretold[key], key
 
 
 def test_a_cut_is_recorded_and_laid_on_the_bench(lab: Lab, tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ import time
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from fabctl.cli.main import cli
 from fabctl.errors import RecordError
 from fabctl.events import Event
 from fabctl.records.export import export
@@ -171,3 +173,24 @@ def test_the_list_is_to_be_had_where_nothing_can_be_written(tmp_path: Path) -> N
     run.finish("done")
     (tmp_path / "index.sqlite").mkdir()
     assert {row.run: row.status for row in rows(tmp_path)}[run.run_id] == "done"
+
+
+def test_the_list_tells_what_a_run_came_to_and_on_which_kind_of_bench(tmp_path: Path) -> None:
+    made = (
+        ("cut", {"bench": {"simulated": True}}, {"burnt_mm": 5210.0, "actual_s": 290.4, "estimate_s": 288.0}),
+        ("indent", {"simulated": False}, {"stiffness_secant_N_mm": 0.00697, "curves_count": 2, "gain_ratio": 1.0}),
+        ("calibrate", {"bench": "lab", "simulated": True}, {"gain_ratio": 1.0021}),
+        ("report", {}, {}),
+    )
+    runs = tmp_path / "runs"
+    for kind, config, result in made:
+        run = start_run(runs, kind, config=config)
+        run.write_result(result)
+        run.finish("done", "all told" if kind == "report" else "")
+    found = {row.kind: (row.simulated, row.message) for row in rows(runs)}
+    assert found["cut"] == (True, "5.21 m burnt, 290 s, estimated 288 s")
+    assert found["indent"] == (False, "2 curves, secant stiffness 0.00697 N/mm")
+    assert found["calibrate"] == (True, "gain of the load cell 1.002")
+    assert found["report"] == (None, "all told")
+    told = CliRunner().invoke(cli, ["--home", str(tmp_path), "run", "list", "--kind", "cut"]).output
+    assert "simulated 5.21 m burnt" in told.splitlines()[1]

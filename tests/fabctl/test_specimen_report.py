@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from fabctl.records.folder import RunFolder, start_run
+from fabctl.reports.indent_step import indent_step
 from fabctl.reports.page import render
 from fabctl.reports.specimen import specimen_report, telling, verdict
 from fabctl.workspace import Specimen, Workspace
@@ -92,7 +93,22 @@ def test_the_verdict_says_what_was_done_on_simulators(lab: Workspace, specimen: 
         start_run(lab.runs, kind, specimen="S-0001", config=config).finish("done")
     report = specimen_report(lab, specimen)
     assert report.sentence.endswith("Simulated, on no real device: cut, indent.")
-    assert "Simulated, on no real device" in render(report)
+    page = render(report)
+    assert "Simulated, on no real device" in page
+    assert [step.simulated for step in report.steps] == [False, True, True, False]
+    assert page.count('<span class="simulated">') == 2
+
+
+def test_figures_of_a_curve_are_told_to_the_digits_of_their_uncertainty_and_in_words(
+    lab: Workspace, specimen: Specimen
+) -> None:
+    made = start_run(lab.runs, "indent", specimen="S-0001", config={"conditions": {"humidity_frac": 0.45}})
+    found = {"stiffness_secant_N_mm": 0.0069712, "stiffness_secant_ci95_N_mm": 3.91e-5, "hysteresis_ratio": 0.0585}
+    made.write_result(found)
+    made.finish("done")
+    facts = {fact.label: fact.value for fact in indent_step(made, specimen.design).facts}
+    assert facts["secant stiffness"] == "0.006971 ± 0.000039 N/mm"
+    assert (facts["hysteresis"], facts["humidity"]) == ("5.9 %", "45.0 %")
 
 
 def test_a_real_bench_is_not_called_simulated(lab: Workspace, specimen: Specimen) -> None:

@@ -19,24 +19,13 @@ from fabctl.indent.resume import points_without_contact
 from fabctl.records.folder import open_run, status_of
 from fabctl.testing import SimulatedBench
 from fabctl.workspace import Workspace
-from tests.rig_endpoints import simulated_rig
+from tests.rig_endpoints import rig_bench, short_method, simulated_rig
 
 STIFFNESS_N_MM = 0.2
-METHOD = """name: short
-sample_hz: 100
-safe_height_mm: 0.5
-travel_speed_mm_s: 20
-acceleration_mm_s2: 200
-limits: {force_N: 4, tension_N: 1, travel_mm: 40, watchdog_s: 1.0}
-steps:
-  - {step: tare, time_s: 0.3}
-  - {step: approach, speed_mm_s: 6, trigger_N: 0.01, clearance_mm: 0.8}
-  - {step: cycles, cycles_count: 2, depth_mm: 2.6, speed_mm_s: 2, unload_speed_mm_s: 6}
-"""
-BENCH = """name: short
-rig: {url: "URL", map: reference, travel_mm: 60, force_limit_N: 20, indenter_radius_mm: 8}
-specimen_slot: "SLOT"
-"""
+METHOD = short_method(
+    "step: approach, speed_mm_s: 6, trigger_N: 0.01, clearance_mm: 0.8",
+    "step: cycles, cycles_count: 2, depth_mm: 2.6, speed_mm_s: 2, unload_speed_mm_s: 6",
+)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +45,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedBench]:
     slot.mkdir()
     words = ("--tcp", "0", "--slot", str(slot), "--truth", str(home / "truth"), "--compliance-mm-N", "0.3")
     with simulated_rig(*words, "--gain", "1.02", "--noise-N", "0.0005") as url:
-        (home / "bench.yaml").write_text(BENCH.replace("URL", url).replace("SLOT", str(slot)))
+        (home / "bench.yaml").write_text(rig_bench(url, slot=str(slot)))
         yield SimulatedBench(lab, {"rig": url})
 
 
@@ -103,7 +92,7 @@ def test_the_run_keeps_method_calibration_and_conditions(bench: SimulatedBench, 
     assert config["conditions"]["temperature_degC"] == pytest.approx(22.5)
     assert (config["conditions"]["batch"], config["conditions"]["rest_h"]) == ("B7", 24.0)
     (told,) = [f for f in config["findings"] if f["code"] == "INDENT-CONDITIONS"]
-    assert told["message"] == "not recorded: thickness_mm"
+    assert told["message"] == "not recorded: the sheet's thickness"
     assert config["rig"]["firmware"] == "1.04"
 
 
@@ -162,22 +151,12 @@ def test_a_method_beyond_the_limits_is_refused_before_anything_moves(bench: Simu
     assert (bench.lab.root / "truth" / "rig-events.jsonl").read_text() == before
 
 
-GRID = """name: two
-sample_hz: 100
-safe_height_mm: 0.5
-travel_speed_mm_s: 20
-acceleration_mm_s2: 200
-limits: {force_N: 4, tension_N: 1, travel_mm: 40, watchdog_s: 1.0}
-steps:
-  - step: grid
-    x_mm: [X]
-    y_mm: [0]
-    speed_mm_s: 20
-    steps:
-      - {step: tare, time_s: 0.3}
-      - {step: approach, speed_mm_s: 8, trigger_N: 0.01, clearance_mm: 0.8, travel_mm: 12}
-      - {step: cycles, cycles_count: 1, depth_mm: 2.8, speed_mm_s: 2, unload_speed_mm_s: 6}
-"""
+GRID_STEPS = (
+    "step: tare, time_s: 0.3",
+    "step: approach, speed_mm_s: 8, trigger_N: 0.01, clearance_mm: 0.8, travel_mm: 12",
+    "step: cycles, cycles_count: 1, depth_mm: 2.8, speed_mm_s: 2, unload_speed_mm_s: 6",
+)
+GRID = f"step: grid, x_mm: [X], y_mm: [0], speed_mm_s: 20, steps: [{', '.join(f'{{{step}}}' for step in GRID_STEPS)}]"
 
 
 def test_a_grid_point_beside_the_specimen_is_told_in_the_result_and_the_others_are_measured(
@@ -189,8 +168,8 @@ def test_a_grid_point_beside_the_specimen_is_told_in_the_result_and_the_others_a
     corners = np.array([[-20.0, -20, 0], [20, -20, 0], [20, 20, 0], [-20, 20, 0]])
     write_ply(design / "deployed.ply", TriMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])))
     specimen = bench.lab.new_specimen(design).name
-    (bench.lab.root / "two.yaml").write_text(GRID.replace("X", "0, 60"))
-    (bench.lab.root / "beside.yaml").write_text(GRID.replace("X", "60").replace("two", "beside"))
+    (bench.lab.root / "two.yaml").write_text(short_method(GRID.replace("X", "0, 60"), name="two"))
+    (bench.lab.root / "beside.yaml").write_text(short_method(GRID.replace("X", "60"), name="beside"))
     words = ("indent", "run", specimen, "--bench", "bench.yaml", "--yes", "--method")
     found = bench.fabctl(*words, "two.yaml")
     assert found["status"] == "done"

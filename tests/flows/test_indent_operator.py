@@ -10,30 +10,25 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from fabctl.indent.analysis import read_samples
 from fabctl.records.folder import RunFolder, open_run, status_of
 from fabctl.testing import SimulatedBench
 from fabctl.workspace import Workspace
-from tests.rig_endpoints import ROOT, simulated_rig
+from tests.rig_endpoints import ROOT, rig_bench, short_method, simulated_rig
 
-METHOD = """name: short
-sample_hz: 100
-safe_height_mm: 0.5
-travel_speed_mm_s: 20
-acceleration_mm_s2: 200
-limits: {force_N: 4, tension_N: 1, travel_mm: 40, watchdog_s: 0.5}
-steps:
-  - {step: tare, time_s: 0.3}
-  - {step: approach, speed_mm_s: 8, trigger_N: 0.02, clearance_mm: 0.8}
-  - {step: cycles, cycles_count: 2, depth_mm: 2.8, speed_mm_s: 2, unload_speed_mm_s: 6}
-"""
-BENCH = """name: short
-rig: {url: "URL", map: reference, travel_mm: 60, force_limit_N: 20, indenter_radius_mm: 8}
-"""
+METHOD = short_method(
+    "step: approach, speed_mm_s: 8, trigger_N: 0.02, clearance_mm: 0.8",
+    "step: cycles, cycles_count: 2, depth_mm: 2.8, speed_mm_s: 2, unload_speed_mm_s: 6",
+    watchdog_s=0.5,
+)
 TEST = ("indent", "run", "S-0001", "--method", "short.yaml", "--bench", "bench.yaml", "--yes")
 ON = ("--bench", "bench.yaml")
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
 
 @pytest.fixture
@@ -45,7 +40,7 @@ def bench(tmp_path: Path) -> Iterator[SimulatedBench]:
     (tmp_path / "short.yaml").write_text(METHOD)
     words = ("--tcp", "0", "--truth", str(tmp_path / "truth"), "--specimen", "linear", "--contact-mm", "6")
     with simulated_rig(*words, "--compliance-mm-N", "0", "--gain", "1", "--zero-N", "0.01") as url:
-        (tmp_path / "bench.yaml").write_text(BENCH.replace("URL", url))
+        (tmp_path / "bench.yaml").write_text(rig_bench(url))
         yield SimulatedBench(lab, {"rig": url})
 
 
@@ -56,31 +51,50 @@ def test_by_hand_the_stage_is_homed_jogged_to_the_first_touch_and_drawn_back(ben
     bench.fabctl("rig", "jog", "3", *ON, expect=5)  # nobody said yes
     assert bench.fabctl("rig", "info", *ON)["position_mm"] == pytest.approx(0.0, abs=0.01)
     assert bench.fabctl("rig", "jog", "3", *ON, "--yes")["position_mm"] == pytest.approx(3.0, abs=0.01)
+    assert bench.fabctl("rig", "jog", "-1", *ON, "--yes")["position_mm"] == pytest.approx(2.0, abs=0.01)
     touched = bench.fabctl("rig", "jog", "20", *ON, "--yes", "--speed-mm-s", "4")
     assert touched["force_gross_N"] == pytest.approx(1.05, abs=0.08)  # it brakes
     assert touched["position_mm"] == pytest.approx(8.1, abs=0.2)
     bench.fabctl(*TEST, expect=3)  # a test must not begin on a pressed specimen
-    drawn = bench.fabctl("rig", "retract", *ON, "--yes", "--speed-mm-s", "10")
-    assert drawn["position_mm"] == pytest.approx(0.0, abs=0.01)
+    command = [sys.executable, "-m", "fabctl", "--home", str(bench.lab.root), "rig", "retract", *ON, "--yes"]
+    drawn = subprocess.run(command, capture_output=True, text=True, cwd=bench.lab.root, env=ENVIRONMENT, check=True)
+    assert "retract: at 0.000 mm" in drawn.stdout
+    shares = [float(line.split("%")[0]) for line in drawn.stderr.splitlines() if "% " in line]
+    assert len(shares) > 5  # eight seconds, and not in silence
+    assert shares == sorted(shares)
+    assert bench.fabctl("rig", "info", *ON)["position_mm"] == pytest.approx(0.0, abs=0.01)
 
 
 def broken_off(bench: SimulatedBench, number: signal.Signals) -> tuple[int, RunFolder]:
     """Begin a test, send it a signal while it loads the second time; return its exit code and run."""
     command = [sys.executable, "-m", "fabctl", "--home", str(bench.lab.root), *TEST]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=bench.lab.root, env=environment
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=bench.lab.root, env=ENVIRONMENT
     )
     assert process.stderr is not None
     for line in process.stderr:
         if line.startswith("load") and "curve 2" in line:
             break
-    time.sleep(0.9)  # into contact
-    process.send_signal(number)
-    code = process.wait(timeout=30)
-    process.stderr.close()
     (run,) = bench.lab.runs_of("S-0001", "indent")
+    while not _pressed(run):
+        time.sleep(0.02)
+    process.send_signal(number)
+    code = process.wait(timeout=60)
+    process.stderr.close()
     return code, run
+
+
+def _pressed(run: RunFolder) -> bool:
+    """Tell whether the second loading has met the specimen."""
+    samples = read_samples(run.path / "samples.csv")
+    return bool(np.any((samples.step == "load") & (samples.curve == 2) & (samples.force_N > 0.2)))
+
+
+def _standing(bench: SimulatedBench) -> dict[str, Any]:
+    """Return how the rig stands once its watchdog has had its time."""
+    while (found := bench.fabctl("rig", "info", *ON))["state"] == "moving":
+        pass
+    return found
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, "stopped"), (signal.SIGKILL, "interrupted")])
@@ -90,8 +104,7 @@ def test_a_test_that_was_broken_off_stands_where_it_is_and_goes_on_at_the_next_c
     code, first = broken_off(bench, number)
     assert code == (5 if number == signal.SIGINT else -signal.SIGKILL)
     assert status_of(first) == status
-    time.sleep(0.7)  # the watchdog's time
-    stands = bench.fabctl("rig", "info", *ON)
+    stands = _standing(bench)
     assert stands["position_mm"] > 5.5
     assert stands["state"] == ("disarmed" if number == signal.SIGINT else "faulted")
     told = [json.loads(row) for row in (bench.lab.root / "truth" / "rig-events.jsonl").read_text().splitlines()]

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -84,49 +83,42 @@ def test_a_sweep_killed_at_any_moment_loses_only_the_column_in_hand(plan: Plan, 
     code = (
         "from pathlib import Path\nfrom design.cells.sheet import Sheet\n"
         "from design.cells.sweep import plan_of, sweep\n"
-        f"sweep(plan_of(Sheet(), 5, 0.35), Path({str(tmp_path / 'parts')!r}))"
+        "tell = lambda now: print(now.done_count, flush=True)\n"
+        f"sweep(plan_of(Sheet(), 5, 0.35), Path({str(tmp_path / 'parts')!r}), report=tell)"
     )
-    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
-    give_up = time.monotonic() + 120
-    while not list((tmp_path / "parts").rglob("column-*.json")) and time.monotonic() < give_up:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    with process.stdout:
+        assert process.stdout.readline()  # the first column is done, and the next one begun
+        process.send_signal(signal.SIGKILL)
     process.wait()
     assert list((tmp_path / "parts").rglob("column-*.json"))
     assert library_bytes(plan, sweep(plan, tmp_path / "parts"), tmp_path / "library.npz") == alone
 
 
+CLUSTER = """
+import sys
+from distributed import LocalCluster
+
+if __name__ == "__main__":
+    quiet = {"dashboard_address": None, "local_directory": "."}
+    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", **quiet) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[str]:
-    """A dask scheduler and two workers, each its own process."""
-    address = tmp_path / "scheduler.json"
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    words = [sys.executable, "-m", "dask"]
-    scheduler = [*words, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-    worker = [*words, "worker", "--nthreads", "1", "--no-dashboard", "--no-nanny", "--local-directory", str(tmp_path)]
-    commands = [scheduler, worker, worker]
-    processes = [
-        subprocess.Popen([*command, "--scheduler-file", str(address)], env=environment, cwd=tmp_path, **quiet)  # type: ignore[call-overload]
-        for command in commands
-    ]
-    try:
-        import json
-
-        give_up = time.monotonic() + 60
-        while time.monotonic() < give_up:
-            if address.exists() and address.stat().st_size:
-                break
-            time.sleep(0.1)
-        yield json.loads(address.read_text())["address"]
-    finally:
-        for process in reversed(processes):  # workers first: they say goodbye to the scheduler
-            process.terminate()
-            try:
-                process.wait(timeout=5)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+    """A dask scheduler and two workers, each its own process, until the pipe to them is shut."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", CLUSTER], env={**os.environ, "PYTHONPATH": str(ROOT)}, cwd=tmp_path, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    with process:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+        process.communicate()
 
 
 @pytest.mark.slow

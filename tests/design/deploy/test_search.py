@@ -35,6 +35,8 @@ def test_a_hint_pushes_the_bump_at_its_place_to_its_side(dumbbell) -> None:
     both_up = solve_level(dumbbell, design)
     again = hinted(dumbbell, design, [(-36.0, 0.0, 1.0), (36.0, 0.0, 1.0)])
     assert again.energy_mJ == pytest.approx(both_up.energy_mJ, rel=1e-6)
+    with pytest.raises(ValueError, match="beside the sheet"):
+        hinted(dumbbell, design, [(999.0, 0.0, 1.0)])
     one_down = hinted(dumbbell, design, [(30.0, 5.0, -1.0)])
     assert one_down.stable
     assert one_down.energy_mJ > 1.02 * both_up.energy_mJ

@@ -15,7 +15,7 @@ from design.cells.hinges import cells_as_cut
 from design.errors import BundleError
 from design.meshfiles import read_mesh
 from fabctl.cli.deploy import command
-from fabctl.deploying import divided, read_laid, wells_of
+from fabctl.deploying import divided, farthest_mm, read_laid, wells_of
 from fabctl.designing import build_compensated, build_folder, design_of, read_inputs
 from fabctl.errors import RefusedError
 
@@ -50,6 +50,10 @@ def test_deploying_a_design_writes_shape_pictures_and_numbers(folder: Path, tmp_
     assert told["residual_ratio"] < 1e-8
     assert told["loaded_residual_ratio"] < 1e-8
     assert 0 < told["sag_mm"] < 5
+    laid = read_laid(folder, folder.parent)
+    shown = read_mesh(out / "deployed.ply")[0]
+    assert farthest_mm(shown, laid.target).max() == pytest.approx(told["loaded_deviation_max_mm"], abs=1e-3)
+    assert told["loaded_deviation_mean_mm"] < told["loaded_deviation_max_mm"]
     assert {p.name for p in out.iterdir()} == {"deployed.ply", "deployed.png", "deployment.gif", "deploy.json"}
     assert len(read_mesh(out / "deployed.ply")[0].faces) == told["units_count"]
     assert (out / "deployment.gif").read_bytes()[:4] == b"GIF8"

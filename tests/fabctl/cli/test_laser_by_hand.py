@@ -15,6 +15,7 @@ from benchmarks._laser_rig import Rig
 from drivers.grbl.laser import Laser
 from fabctl.cli import laser as by_hand
 from fabctl.config.bench import LaserConfig
+from fabctl.errors import RefusedError
 
 BENCH = SimpleNamespace(
     config=SimpleNamespace(name="small", laser=LaserConfig(url="tcp://x:1", travel_mm=(300.0, 200.0)))
@@ -35,6 +36,13 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
     return rig
 
 
+@pytest.mark.parametrize("words", [["frame", "400", "10"], ["testgrid", "--powers", "0.5", "--feeds", "200"]])
+def test_what_would_be_refused_is_not_asked_for(rig: Rig, words: list[str]) -> None:
+    found = CliRunner().invoke(by_hand.command, words)
+    assert isinstance(found.exception, RefusedError)
+    assert "?" not in found.output
+
+
 def steps(rig: Rig) -> tuple[int, int, int]:
     return rig.board.machine.position_steps()
 
@@ -47,9 +55,10 @@ def steps(rig: Rig) -> tuple[int, int, int]:
     ],
 )  # fmt: skip
 def test_what_moves_burns_or_writes_waits_for_a_yes(rig: Rig, words: list[str]) -> None:
+    CliRunner().invoke(by_hand.command, ["jog", "-50", "-50", "--yes"])  # where there is room
     before = steps(rig), dict(rig.board.machine.memory.values)
     found = CliRunner().invoke(by_hand.command, words)
-    assert found.exit_code == 1  # click's own abort; the command line makes it 5
+    assert found.exit_code == 1  # the command line makes it 5
     assert "--yes answers yes" in found.output
     assert (steps(rig), dict(rig.board.machine.memory.values)) == before
     assert all(point.power_frac == 0 for point in rig.trace)

@@ -126,7 +126,7 @@ def test_a_full_disk_behind_stdout_is_the_disks_fault() -> None:
 
 
 CLOSING = """
-import os, pathlib, signal, sys, time, click
+import os, pathlib, signal, sys, click
 from fabctl.cli import common
 from fabctl.records.folder import start_run
 
@@ -136,10 +136,9 @@ def command(runs):
     run = start_run(pathlib.Path(runs), "scan")
     try:
         print("begun", flush=True)
-        time.sleep(60)
+        signal.pause()
     except KeyboardInterrupt:
-        os.kill(os.getpid(), signal.SIGTERM)  # the group's, and then the flow's
-        time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGTERM)  # the group's, and then the flow's: it is delivered before kill returns
         run.finish("stopped", "stopped by the operator")
         raise
 
@@ -153,7 +152,7 @@ def test_signals_that_come_together_leave_a_record_of_how_the_run_ended(tmp_path
     assert process.stdout is not None
     assert process.stdout.readline() == "begun\n"
     process.terminate()
-    _, err = process.communicate(timeout=30)
+    _, err = process.communicate()
     assert process.returncode == OPERATOR, err
     (run,) = (tmp_path / "runs").iterdir()
     assert '"stopped"' in (run / "outcome.json").read_text()

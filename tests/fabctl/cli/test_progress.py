@@ -47,6 +47,16 @@ def test_a_message_takes_the_place_of_the_live_line(
     assert screen(capsys.readouterr().err) == ["stopped", "homing"]
 
 
+def test_work_of_unknown_length_is_seen_to_go_on_at_a_terminal_and_fills_no_log(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    progress()(Event("progress", "a pose found by the search"))
+    assert capsys.readouterr().err == ""
+    at_a_terminal(monkeypatch)
+    progress()(Event("progress", "a pose found by the search"))
+    assert screen(capsys.readouterr().err) == ["        a pose found by the search"]
+
+
 def test_a_result_and_a_question_do_too(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     at_a_terminal(monkeypatch)
     listen = progress()

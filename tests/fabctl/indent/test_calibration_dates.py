@@ -28,9 +28,9 @@ def test_only_the_one_that_is_past_its_date_is_flagged() -> None:
 
 def test_the_report_gives_uncertainty_and_date_and_flags_what_was_past_it() -> None:
     force, frame = _calibration_facts(BOTH.as_dict(), MADE + timedelta(days=31))
-    assert force.value == "1.01 ± 0.002"
+    assert force.value == "1.0100 ± 0.0020"
     assert force.note == "PAST ITS DATE: ended on 2026-01-31"
-    assert frame.value == "0.02 ± 0.0002 mm/N"
+    assert frame.value == "0.02000 ± 0.00020 mm/N"
     assert frame.note == "valid to 2027-01-01"
 
 

@@ -26,5 +26,5 @@ def test_a_deployment_at_no_time_gives_no_rest(broken: object) -> None:
 def test_what_nobody_recorded_is_named_and_nothing_is_said_where_all_is_there() -> None:
     (only,) = unrecorded(conditions({"batch": "B7"}, {}))
     assert (only.code, only.level) == ("INDENT-CONDITIONS", "warning")
-    assert "thickness_mm, rest_h" in only.message
+    assert "the sheet's thickness, hours of rest" in only.message
     assert unrecorded({"thickness_mm": 2.3, "batch": "B7", "rest_h": 1.0}) == []

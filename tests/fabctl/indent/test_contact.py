@@ -95,6 +95,42 @@ def test_a_sharp_drift_before_contact_is_not_taken_for_the_specimen(name: str, d
     assert [one.drift_N_mm for one in found] == pytest.approx([drift_N_mm] * 3, abs=0.012)
 
 
+BENT: dict[str, Callable[[Reals], Reals]] = {
+    "growing": lambda x: 0.02 * x**2,
+    "turning": lambda x: -0.02 * x**2,
+    "settling": lambda x: 0.08 * (1 - np.exp(-x)),
+}
+
+
+@pytest.mark.parametrize("drift", sorted(BENT))
+@pytest.mark.parametrize("name", ["softening", "straight", "Hertzian"])
+def test_a_drift_that_bends_by_80_mN_before_contact_is_not_taken_for_the_specimen(name: str, drift: str) -> None:
+    """A straight free part would put the contact up to 1.3 mm early here, with an error of 0.02 mm told."""
+    for seed in range(3):
+        u, force = curve(STARTS[name], seed, noise_N=0.003, drift_N_mm=0.0, free_mm=2.0)
+        found = find_contact(u, force + BENT[drift](u - u[0]))
+        assert found.position_mm is not None
+        assert found.drift_N_mm2 != 0
+        off_mm = abs(found.position_mm - 7.3)
+        assert off_mm < (0.06 if name == "Hertzian" else 0.02)
+        assert off_mm < 4 * (found.se_mm or 0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_specimen_that_stiffens_after_a_first_touch_is_no_drift_that_bends(seed: int) -> None:
+    found = find_contact(*curve(lambda d: 0.3 * d + 0.5 * np.maximum(d - 0.7, 0.0), seed, drift_N_mm=0.0, free_mm=0.6))
+    assert found.position_mm == pytest.approx(7.3, abs=0.1)
+    assert found.drift_N_mm2 == 0
+
+
+def test_a_bump_of_the_noise_that_falls_again_is_no_contact() -> None:
+    """A fit that rises and falls again before the sure rise would be half a millimetre early in this draw."""
+    rng = np.random.default_rng(10)
+    u = np.arange(0, 5.2, 0.01)
+    found = find_contact(u, 0.3 * np.maximum(u - 2.0, 0.0) ** 1.5 + rng.normal(0, 0.01, len(u)))
+    assert found.position_mm == pytest.approx(2.0, abs=0.1)
+
+
 def test_no_drift_is_told_where_there_is_none() -> None:
     told = [find_contact(*curve(STARTS["softening"], seed, drift_N_mm=0.0)).drift_N_mm for seed in range(20)]
     assert sum(drift_N_mm != 0 for drift_N_mm in told) <= 3
@@ -139,3 +175,14 @@ def test_a_load_cell_behind_a_filter_errs_slowly_and_is_believed_less(name: str)
     off_mm = [abs((one.position_mm or 0.0) - 7.3) for one in found]
     assert max(off_mm) < 0.05
     assert min(one.se_mm or 0.0 for one in found) > 0.006
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 4])
+def test_a_slow_wave_before_contact_is_noise_and_no_contact(seed: int) -> None:
+    """Draughts sway a soft cell: taken for a start, they put the contact a millimetre early."""
+    rng = np.random.default_rng(seed)
+    u = np.arange(0, 5.0, 0.01)
+    loaded = np.maximum(u - 1.5, 0.0)
+    quiet = 0.6 * loaded - 0.09 * loaded**2 + 0.006 * loaded**3 + rng.normal(0, 0.002, len(u))
+    found = find_contact(u, quiet + 0.01 * np.sin(0.018 * np.pi * np.arange(len(u)) + rng.uniform(0, 6)))
+    assert found.position_mm == pytest.approx(1.5, abs=0.06)

@@ -14,6 +14,7 @@ from fabctl.config.loader import parse
 from fabctl.config.method import MethodConfig
 from fabctl.indent.analysis import analyse
 from fabctl.indent.curve import CurveResult, Strokes, _extrema, analyse_curve
+from fabctl.indent.freepart import without_spikes
 from fabctl.indent.method import actions
 from fabctl.indent.run import Runner
 from simulators.rig.controller import Controller, Machine
@@ -179,3 +180,24 @@ def test_snap_through_and_snap_back_are_jumps_of_the_force() -> None:
     rigid = result(bistable(2.5, 7.0), 9.5)
     assert rigid.snap_through is None
     assert "never falls at once" in rigid.reasons["snap_through"]
+
+
+def test_single_samples_that_stand_out_are_left_out_and_counted() -> None:
+    """One of half a newton before contact would put that a millimetre early."""
+    u = np.arange(0, 5.0, 0.01)
+    force = 0.5 * np.maximum(u - 1.5, 0.0) + np.random.default_rng(1).normal(0, 0.002, len(u))
+    plain = analyse_curve(Strokes(u, force, u[::-1], force[::-1]))
+    hit = force.copy()
+    hit[[60, 350, 420]] += (0.5, -0.3, 2.0)
+    found = analyse_curve(Strokes(u, hit, u[::-1], force[::-1]))
+    assert (plain.spikes_count, found.spikes_count) == (0, 3)
+    assert found.contact.position_mm == pytest.approx(1.5, abs=0.02)
+    assert found.force_max_N == pytest.approx(plain.force_max_N)
+
+
+def test_a_cusp_and_a_snap_are_no_disturbances() -> None:
+    u = np.arange(0, 6.0, 0.15)
+    cusp = np.where(u < 4.05, 0.5 * np.maximum(u - 2.0, 0.0), 0.2)
+    calm, count = without_spikes(cusp, 1e-3)
+    assert count == 0
+    np.testing.assert_array_equal(calm, cusp)

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from fabctl.cli.indent import command
 from fabctl.errors import UsageError
+from fabctl.indent.export import export
 from fabctl.indent.groups import analyse_groups, parse_groups
 from fabctl.indent.recorder import COLUMNS, Row
 from fabctl.records.folder import start_run
@@ -94,3 +95,13 @@ def test_the_command_names_the_figure_of_each_ratio_and_each_run(lab: Workspace)
 def test_a_group_that_is_none_is_refused(lab: Workspace, words: str, why: str) -> None:
     with pytest.raises(UsageError, match=why):
         parse_groups(lab, (), [words])
+
+
+def test_a_run_that_is_no_indentation_is_bad_input_and_told_as_what_it_is(lab: Workspace) -> None:
+    scan, refused = start_run(lab.runs, "scan", specimen="S-0001"), start_run(lab.runs, "indent", specimen="S-0002")
+    refused.finish("refused", "the rig is not ready")
+    for run, said in ((scan, "not an indentation but a scan"), (refused, r"holds no samples.*\(refused\)")):
+        with pytest.raises(UsageError, match=said):
+            analyse_groups(parse_groups(lab, (run.run_id,), ()))
+        with pytest.raises(UsageError, match=said):
+            export(run, "csv", lab.root / "samples.csv")

@@ -9,7 +9,8 @@ import pytest
 
 from benchmarks._rig_memory import REGISTERS, Kept, MemoryBus, method
 from drivers.errors import DeviceTimeout
-from drivers.rig.indenter import Indenter, RigFaulted
+from drivers.rig.indenter import Indenter
+from drivers.rig.refusals import RigFaulted
 from drivers.rig.samples import Sample
 from fabctl.config.loader import parse
 from fabctl.config.method import MethodConfig
