@@ -60,7 +60,7 @@ def _is_registration(path: Path) -> bool:
 
 
 def plain_job_options(command: F) -> F:
-    """Give a command what every job that makes no specimen takes."""
+    """Give a command what every job that is no design takes."""
     origin = click.option(
         "--origin",
         type=click.Choice(["home", "here"]),
