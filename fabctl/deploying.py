@@ -174,7 +174,9 @@ def farthest_mm(mesh: TriMesh, target: TriMesh) -> Reals:
     """Return for every unit the distance of its farthest sample from the target, `(m,)`."""
     from design.deploy.compare import closest, surface_samples
 
-    return np.asarray(closest(surface_samples(mesh.vertices_mm, mesh.faces)[0], target)[0]).reshape(-1, 4).max(axis=1)
+    distance_mm = closest(surface_samples(mesh.vertices_mm, mesh.faces)[0], target)[0]
+    farthest: Reals = distance_mm.reshape(-1, 4).max(axis=1)
+    return farthest
 
 
 def picture_png(mesh: TriMesh, target: TriMesh, title: str) -> bytes:
