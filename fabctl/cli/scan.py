@@ -312,6 +312,7 @@ def _compared(
     here: Workspace, request: Request, specimen: Specimen | None, source: dict[str, Any]
 ) -> tuple[RunFolder, dict[str, Any], int]:
     """Compare and write the run record; return it with the result and the exit code."""
+    from fabctl.events import Event
     from fabctl.records.folder import start_run
     from fabctl.reports.scan import write_scan_report
     from fabctl.scan.job import compare, record
