@@ -49,13 +49,19 @@ class Measured:
         return abs(self.off_ratio()) <= self.uncertainty_ratio
 
 
-def open_coupon(folder: Path) -> dict[str, PatchAsCut]:
-    """Return what was cut, from the `cells.csv` of a coupon's folder; raise `RefusedError` where it is none."""
+def open_coupon(folder: Path, form: Path) -> dict[str, PatchAsCut]:
+    """Return what was cut, from the `cells.csv` of a coupon's folder; raise `RefusedError` where it is none.
+
+    `form` is read first: one that cannot be read is told before the folder it lies in.
+    """
+    text_of(form, "a coupon's form")
     try:
         found = open_bundle(folder)
     except NoBundle as fault:
         hint = "leave it in the coupon's folder, or say whose it is with --specimen"
-        told = Finding("COUPON-ALONE", "holds no coupon, so what was cut is not known", where=str(folder), hint=hint)
+        told = Finding(
+            "COUPON-ALONE", f"what was cut is not known: {folder} holds no coupon", where=str(form), hint=hint
+        )
         raise UnreadableInput("the form cannot be read there", [told]) from fault
     if found.kind != "coupon":
         told = Finding("COUPON-SPECIMEN", "was cut from a design, not from a coupon", where=str(folder))

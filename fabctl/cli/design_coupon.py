@@ -87,7 +87,7 @@ def coupon_read(form: str, length_error_mm: float, specimen: str | None, as_json
     else:
         path = Path(form)
     path = path / "coupon.csv" if path.is_dir() else path
-    cut = open_coupon(path.parent if specimen is None else lab().specimen(specimen).design)
+    cut = open_coupon(path.parent if specimen is None else lab().specimen(specimen).design, path)
     patches = read_form(path, length_error_mm, cut)
     data: dict[str, Any] = {"patches": as_rows(patches)}
     if specimen is not None:

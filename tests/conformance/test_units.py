@@ -27,10 +27,10 @@ UNIT = re.compile(
 # Mathematics keeps its letters where the formula is in view; an elastic modulus ends in its unit anyway.
 LETTERS = {"u", "nu", "mu", "lam", "k", "K", "a", "b", "c", "d", "x", "y", "z"}
 # These hold figures in whatever unit they were made of: an interval of a stiffness or of an energy, a line through any
-# two quantities, a finding's measure, a register's scale and limits, a matrix, the derivatives of a dimensionless
-# energy.
+# two quantities, places and what is prescribed there, a finding's measure, a register's scale and limits, a matrix, the
+# derivatives of a dimensionless energy.
 GENERIC = {
-    "Finding.value", "Finding.limit",
+    "Finding.value", "Finding.limit", "FlattenConfig.rim_u",
     "Comparison.scale", "Fit.chi2", "Fit.powers", "PeriodicCell.share", "Response.direction", "Scale.to_board",
     "RegisterConfig.scale", "RegisterConfig.min", "RegisterConfig.max", "Register.low", "Register.high",
     "Delivery.parts", "State.slope", "State.curve_total", "Tangent.slope", "Tangent.curve",

@@ -90,11 +90,11 @@ def fill(specimen: Specimen, shift_mm: float, only: str = "AB") -> Path:
 def test_every_hinge_that_is_solved_is_told(lab: Workspace) -> None:
     heard: list[Event] = []
     write_coupon(lab.root / "told", CouponConfig(hinges_mm=(0.25, 0.4)), ROOT, emit=heard.append)
-    assert [event.done_frac for event in heard] == [0.0, 0.5, 1.0]
-    assert "0.25 mm" in heard[0].message and "0.4 mm" in heard[1].message
+    assert [event.done_frac for event in heard] == [0.0, 0.0, 0.45, 0.9]  # the cell, either hinge, the writing
+    assert "0.25 mm" in heard[1].message and "0.4 mm" in heard[2].message
     with pytest.raises(BundleError, match="exists already"):  # and a taken folder is refused before any of it
         write_coupon(lab.root / "told", CouponConfig(hinges_mm=(0.25, 0.4)), ROOT, emit=heard.append)
-    assert len(heard) == 3
+    assert len(heard) == 4
 
 
 def test_a_coupon_is_composed_for_its_own_sheet_with_the_id_on_every_patch(specimen: Specimen) -> None:
@@ -159,7 +159,7 @@ def test_a_form_of_another_coupon_or_with_unknown_patches_is_refused(
     lab: Workspace, specimen: Specimen, tmp_path: Path
 ) -> None:
     with pytest.raises(RefusedError) as caught:
-        read_form(form(tmp_path, FILLED), 0.2, open_coupon(specimen.design))
+        read_form(filled := form(tmp_path, FILLED), 0.2, open_coupon(specimen.design, filled))
     assert [finding.code for finding in caught.value.findings] == ["COUPON-OTHER"] * 5
     assert "patch C was not cut; the coupon has A, B" in str(caught.value)
     code, said = read(lab, str(tmp_path / "coupon.csv"))  # a form without the folder of what was cut
