@@ -174,7 +174,7 @@ def calibrate_force_command(
 
         masses_kg = [mass / 1000 for mass in masses_g]
         try:
-            run, body = calibrate_force(lab().root, bench.config.name, rig, masses_kg, put_on, progress(), valid_days)
+            run, body = calibrate_force(lab().root, bench.config, rig, masses_kg, put_on, progress(), valid_days)
         finally:
             if slot is not None:
                 hang_in_slot(slot, 0.0)
@@ -217,7 +217,7 @@ def calibrate_frame_command(
             block_in_slot(bench.slot)
         assert bench.config.rig is not None
         run, body = calibrate_frame(
-            lab().root, bench.config.name, rig, bench.config.rig, force_N, progress(), block_mm_N, valid_days
+            lab().root, bench.config, rig, bench.config.rig, force_N, progress(), block_mm_N, valid_days
         )
     twice = 2 * body["compliance_se_mm_N"]
     lines = [f"frame {body['compliance_mm_N']:.5f} ± {twice:.5f} mm/N (k = 2), {body['curves_count']} curves"]

@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.clock import Clock, WallClock
 from drivers.rig.indenter import Indenter
-from fabctl.config.bench import RigConfig
+from fabctl.config.bench import BenchConfig, RigConfig
 from fabctl.config.method import Approach, Cycles, LimitsConfig, MethodConfig, Tare
 from fabctl.errors import FabctlError
 from fabctl.events import Emit, Event
@@ -127,7 +127,7 @@ def frame_result(samples: Path, gain_ratio: float, block_mm_N: float = 0.0) -> d
 
 def calibrate_force(
     lab: Path,
-    bench: str,
+    bench: BenchConfig,
     rig: Indenter,
     masses_kg: Sequence[float],
     put_on: Callable[[float], None],
@@ -136,26 +136,27 @@ def calibrate_force(
     clock: Clock | None = None,
 ) -> tuple[RunFolder, dict[str, Any]]:
     """Calibrate the load cell, keep the record, and make it the bench's current one."""
-    run = start_run(lab / "runs", "calibrate", config={"what": "force", "bench": bench, "masses_kg": list(masses_kg)})
+    asked = {"what": "force", "masses_kg": list(masses_kg), "bench": bench.model_dump(mode="json")}
+    run = start_run(lab / "runs", "calibrate", config=asked)
     with outcome_kept(run):
         body = force_result(read_masses(rig, masses_kg, put_on, clock or WallClock(), emit))
         run.write_result(body)
         run.finish("done")
     known = replace(
-        load_calibration(lab, bench) or Calibration(),
+        load_calibration(lab, bench.name) or Calibration(),
         gain_ratio=body["gain_ratio"],
         gain_se_ratio=body["gain_se_ratio"],
         force_run=run.run_id,
         force_utc=datetime.now(UTC).isoformat(),
         force_valid_days_count=valid_days_count,
     )
-    save_calibration(lab, bench, known)
+    save_calibration(lab, bench.name, known)
     return run, body
 
 
 def calibrate_frame(
     lab: Path,
-    bench: str,
+    bench: BenchConfig,
     rig: Indenter,
     config: RigConfig,
     force_N: float,
@@ -166,8 +167,9 @@ def calibrate_frame(
 ) -> tuple[RunFolder, dict[str, Any]]:
     """Press a rigid block, keep the record, and make its compliance the bench's current one."""
     method = frame_method(config, force_N)
-    run = start_run(lab / "runs", "calibrate", config={"what": "frame", "bench": bench, "method": method.model_dump()})
-    before = load_calibration(lab, bench) or Calibration()
+    asked = {"what": "frame", "method": method.model_dump(), "bench": bench.model_dump(mode="json")}
+    run = start_run(lab / "runs", "calibrate", config=asked)
+    before = load_calibration(lab, bench.name) or Calibration()
     with outcome_kept(run):
         with contextlib.closing(Recorder(run.path / "samples.csv")) as recorder:
             Runner(rig, method, actions(method), recorder, clock or WallClock(), config.sample_hz, emit).execute()
@@ -182,7 +184,7 @@ def calibrate_frame(
         frame_utc=datetime.now(UTC).isoformat(),
         frame_valid_days_count=valid_days_count,
     )
-    save_calibration(lab, bench, known)
+    save_calibration(lab, bench.name, known)
     return run, body
 
 

@@ -35,7 +35,7 @@ def test_the_program_of_each_sheet_stays_on_the_bed_and_others_are_refused(tmp_p
         assert x_mm <= BED_MM[0]
         assert y_mm <= BED_MM[1]
     assert reach(composer(bundle, spec, material)("S-0001", 1000.0))[0] > BED_MM[0]
-    with pytest.raises(BundleError, match="paths-99"):
+    with pytest.raises(BundleError, match="no sheet 99"):
         composer(bundle, spec, material, 99)
 
 

@@ -45,7 +45,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedBench]:
     slot.mkdir()
     words = ("--tcp", "0", "--slot", str(slot), "--truth", str(home / "truth"), "--compliance-mm-N", "0.3")
     with simulated_rig(*words, "--gain", "1.02", "--noise-N", "0.0005") as url:
-        (home / "bench.yaml").write_text(rig_bench(url, slot=str(slot)))
+        (home / "bench.yaml").write_text(rig_bench(url, slot=str(slot)) + "simulated: true\n")
         yield SimulatedBench(lab, {"rig": url})
 
 
@@ -75,6 +75,11 @@ def test_gain_and_frame_are_calibrated_to_their_true_values(bench: SimulatedBenc
     found = json.loads((bench.lab.root / "calibrations" / "short.json").read_text())
     assert found["gain_ratio"] == pytest.approx(1.02, abs=max(4 * found["gain_se_ratio"], 5e-4))
     assert found["compliance_mm_N"] == pytest.approx(0.3, abs=0.002)
+
+
+def test_calibrations_on_simulators_are_listed_as_simulated(bench: SimulatedBench, tested: dict[str, object]) -> None:
+    listed = {row["kind"]: row["simulated"] for row in bench.fabctl("run", "list")["runs"]}
+    assert listed == {"calibrate": True, "indent": True}
 
 
 def test_the_stiffness_comes_out_with_gain_and_frame_taken_off(tested: dict[str, object]) -> None:

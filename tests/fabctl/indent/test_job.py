@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,6 +120,15 @@ def test_a_test_refused_by_how_the_rig_was_left_is_recorded_as_refused(lab: Lab)
     assert status_of(run) == "refused"
 
 
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Let Ctrl-C interrupt as it does at first: a command that ran here before leaves it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_nothing_interrupts_what_must_not_be_left_half_done_and_it_comes_afterwards() -> None:
     done = []
     with pytest.raises(KeyboardInterrupt), undisturbed():

@@ -44,9 +44,9 @@ def scanned(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
     return Scanned(home, 1 / truth["scale_ratio"])
 
 
-def run(scanned: Scanned, *words: str) -> dict[str, Any]:
+def run(scanned: Scanned, *words: str, scale: str = "markers") -> dict[str, Any]:
     home = scanned.home
-    fixed = ["scan", "run", str(home / "cloud.ply"), "--target", str(home / "target.obj"), "--scale", "markers"]
+    fixed = ["scan", "run", str(home / "cloud.ply"), "--target", str(home / "target.obj"), "--scale", scale]
     done = CliRunner().invoke(cli, ["--home", str(home), *fixed, *words, "--json"])
     if done.exception and not isinstance(done.exception, SystemExit):
         raise done.exception
@@ -88,7 +88,7 @@ def test_without_its_pictures_or_with_moved_marks_there_is_no_scale(scanned: Sca
     with pytest.raises(RefusedError, match="marks"):
         run(scanned, "--model", str(scanned.home / "shots"), "--marks", str(tmp_path / "other.yaml"))
     with pytest.raises(UsageError, match="belong to --scale markers"):
-        run(scanned, "--model", str(scanned.home / "shots"), "--scale", "free")
+        run(scanned, "--model", str(scanned.home / "shots"), scale="free")
 
 
 def test_bars_picked_on_the_cloud_give_the_scale(scanned: Scanned, tmp_path: Path) -> None:
