@@ -13,12 +13,17 @@ from fabctl.errors import RefusedError, Stopped
 if TYPE_CHECKING:
     from fabctl.records.folder import RunFolder
 
-INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last: a terminal closed, a connection dropped
+
+
+def heard() -> list[signal.Signals]:
+    """Return the signals that end a run: all of `INTERRUPTS`, but for a hang-up that `nohup` has it live through."""
+    return [kind for kind in INTERRUPTS if kind != signal.SIGHUP or signal.getsignal(kind) != signal.SIG_IGN]
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM come only after the block: for short work that must not be left half done.
+    """Let Ctrl-C, SIGTERM and SIGHUP come only after the block: for short work that must not be left half done.
 
     Python interrupts its main thread only, whichever thread the system gave the signal to: a mask would not do.
     """
