@@ -8,30 +8,44 @@ from collections.abc import Callable
 from drivers.clock import Clock
 from drivers.transport import Transport
 
+STOPS = frozenset(b"!\x18\x84\x85")  # hold, reset, door and jog cancel of GRBL: bytes that no line holds
+
 
 class Tap:
-    """A transport around another. What is sent is noted before it goes out, so no byte is ever on the line unseen."""
+    """A transport around another. What is sent is noted before it goes out, so no line is ever sent unseen.
+
+    Only what stops the machine, and the answers to it, need no note: a full disk must not leave a beam on.
+    """
 
     def __init__(self, inner: Transport, note: Callable[[str], None], clock: Clock) -> None:
         self.url = inner.url
         self._inner, self._note, self._clock = inner, note, clock
         self._start_s = clock.now_s()
+        self._stopping = False
 
     def write(self, data: bytes) -> None:
-        """Note `data`, then send it."""
-        self._note(self._row(">", data))
+        """Note `data`, then send it; what stops the machine is sent also where it cannot be noted."""
+        self._stopping = not STOPS.isdisjoint(data)
+        self._keep(">", data)
         self._inner.write(data)
 
     def read(self, timeout_s: float) -> bytes:
         """Receive, then note."""
         data = self._inner.read(timeout_s)
         if data:
-            self._note(self._row("<", data))
+            self._keep("<", data)
         return data
 
     def close(self) -> None:
         """Close the line."""
         self._inner.close()
+
+    def _keep(self, direction: str, data: bytes) -> None:
+        try:
+            self._note(self._row(direction, data))
+        except Exception:
+            if not self._stopping:
+                raise
 
     def _row(self, direction: str, data: bytes) -> str:
         row = {"t_s": round(self._clock.now_s() - self._start_s, 6), "dir": direction, "bytes": data.decode("latin-1")}

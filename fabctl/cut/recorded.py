@@ -10,13 +10,13 @@ from types import FrameType
 from typing import Any
 
 from drivers.errors import DeviceError
-from drivers.grbl.laser import Laser
+from drivers.grbl.laser import Laser, Leaving
 from drivers.grbl.run import StoppedByOperator
 from drivers.transport.tap import read_log
 from fabctl.cut.plan import CutPlan
 from fabctl.cut.trail import begins
 from fabctl.cut.wirelog import WireLog
-from fabctl.errors import FabctlError, RefusedError, Stopped
+from fabctl.errors import FabctlError, RecordError, RefusedError, Stopped
 from fabctl.events import Emit, Event
 from fabctl.records.folder import RunFolder, write_atomically
 
@@ -36,25 +36,38 @@ def recorded(
             yield run, _listener(run, laser, log, emit, plan)
             listen(False)
         except (KeyboardInterrupt, StoppedByOperator) as fault:
-            run.finish("stopped", "stopped by the operator", **_left(laser))
-            raise Stopped(f"stopped; {how_to_go_on(run)}") from fault
-        except FabctlError as fault:
-            run.finish(_status(fault), str(fault), **_left(laser))
-            raise
-        except DeviceError as fault:
-            run.finish("failed", str(fault), fault=type(fault).__name__, **_left(laser))
-            fault.add_note(how_to_go_on(run))
-            raise
+            unwritten = _end(run, laser, "stopped", "stopped by the operator")
+            raise Stopped("\n".join([f"stopped; {how_to_go_on(run)}", *unwritten])) from fault
         except BaseException as fault:
-            run.finish("failed", f"{type(fault).__name__}: {fault}", **_left(laser))
+            status = _status(fault)
+            notes = _end(run, laser, status, **_told(fault))
+            for note in [*notes, *([how_to_go_on(run)] if status == "failed" else [])]:
+                fault.add_note(note)
             raise
         run.finish("done")
 
 
-def _status(fault: FabctlError) -> str:
+def _status(fault: BaseException) -> str:
     if isinstance(fault, Stopped):
         return "stopped"
     return "refused" if isinstance(fault, RefusedError) else "failed"
+
+
+def _told(fault: BaseException) -> dict[str, str]:
+    """Return what the outcome says of the fault."""
+    if isinstance(fault, DeviceError):
+        return {"message": str(fault), "fault": type(fault).__name__}
+    return {"message": str(fault) if isinstance(fault, FabctlError) else f"{type(fault).__name__}: {fault}"}
+
+
+def _end(run: RunFolder, laser: Laser, status: str, message: str, **more: str) -> list[str]:
+    """Write down how the run ended; return what to tell where the disk takes it not, which hides no other fault."""
+    left = _left(laser)
+    try:
+        run.finish(status, message, **more, **left)
+    except (RecordError, OSError) as fault:
+        return [f"how it ended could not be recorded: {fault}; free space on the disk before going on"]
+    return []
 
 
 def _listener(run: RunFolder, laser: Laser, log: WireLog, emit: Emit, plan: CutPlan) -> Emit:
@@ -130,7 +143,10 @@ def how_to_go_on(run: RunFolder) -> str:
 
 def _left(laser: Laser) -> dict[str, Any]:
     """Make sure the beam is off, and return how the machine was left."""
-    left = laser.left or laser.off()
+    try:
+        left = laser.left or laser.off()
+    except Exception as fault:  # noqa: BLE001 - whatever it is, how the run ended is written down
+        left = Leaving(False, False, None, str(fault))
     return {
         "beam_off_confirmed": left.confirmed,
         "position_known": left.position_known,
