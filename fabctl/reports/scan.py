@@ -69,7 +69,7 @@ def scan_report(run: RunFolder) -> Report:
             f"{percent(body['share_within_required_frac'], 0)} is asked"
         )
     elif found is not None:
-        reasons.append("no tolerance was given, so nothing is passed or failed")
+        reasons.append("no tolerance was given (`--tolerance-frac`), so nothing is passed or failed")
     reasons += [f["message"] for f in body.get("findings", []) if f["level"] != "info"]
     steps = [scan_step(run), _alignment_step(body)] + ([_cleaning_step(run, body)] if found is not None else [])
     return Report(

@@ -82,6 +82,14 @@ def test_the_verdict_follows_the_scan(lab: Workspace, specimen: Specimen, change
     assert verdict(telling(lab.runs_of("S-0001")))[0] == word
 
 
+def test_a_scan_without_a_tolerance_says_which_option_gives_one(lab: Workspace, specimen: Specimen) -> None:
+    for kind, result in (("cut", {}), ("indent", {}), ("scan", SCAN | {"tolerance_frac": None})):
+        run(lab, kind, "done", result)
+    word, _, reasons = verdict(telling(lab.runs_of("S-0001")))
+    assert word == "incomplete"
+    assert "--tolerance-frac" in reasons[0]
+
+
 def test_text_from_outside_cannot_become_markup(lab: Workspace, specimen: Specimen) -> None:
     run(lab, "cut", "failed", {}, "<script>alert(1)</script>")
     assert "<script>alert" not in render(specimen_report(lab, specimen))
