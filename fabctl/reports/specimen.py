@@ -43,7 +43,7 @@ def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
     name = _design_name(specimen)
     return Report(
         title=f"Specimen {specimen.name} · {name}",
-        subtitle=f"Made {clock(str(record['made_utc']))}",
+        subtitle=f"Specimen made {clock(str(record['made_utc']))}",
         word=word,
         sentence=sentence,
         reasons=tuple(reasons),
