@@ -264,15 +264,17 @@ def _big_scan(folder: Path, points: int) -> tuple[Path, Path, Scan]:
     return target, cloud, made
 
 
-TIMED = """
-import json, resource, sys, time
+TIMED = r"""
+import json, re, sys, time
 from pathlib import Path
 began = time.perf_counter()
 from fabctl.scan.job import Request, compare, result
 made = compare(Request(Path(sys.argv[2]), Path(sys.argv[1])))
 body = result(made)
+# Not getrusage: its maximum goes through exec, and would be that of the process which made the cloud.
+peak_kB = int(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1])
 print(json.dumps({"wall_s": time.perf_counter() - began, "cpu_s": time.process_time(),
-    "peak_GB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+    "peak_GB": 1024e-9 * peak_kB,
     "points": body["cloud"]["points_count"], "status": body["status"]}))
 """
 

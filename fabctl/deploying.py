@@ -59,7 +59,9 @@ def read_laid(folder: Path, home: Path) -> Laid:
         told = Finding("DEPLOY-COUPON", "is a coupon: flat patches that are pulled open by hand", where=str(folder))
         raise RefusedError("nothing to deploy", [told])
     if "deployed.ply" not in bundle.manifest["files"]:
-        missing = Finding("DEPLOY-NONE", "was built without a prediction", where=str(folder), hint="set `response`")
+        missing = Finding(
+            "DEPLOY-NONE", "was built without a prediction", where=str(folder), hint="take `response: null` out"
+        )
         raise RefusedError("nothing to deploy", [missing])
     rows = bundle.cells()
     table = {name: np.array([float(row[name]) for row in rows]) for name in NUMBERS}

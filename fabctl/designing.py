@@ -40,6 +40,13 @@ from fabctl.events import Emit, Event, silent
 
 WRITING_FROM_FRAC = 0.99  # of a build: what is left is writing the folder
 COUPON_SOLVED_FRAC = 0.9  # the rest is ordering the cut and writing
+UNPREDICTED = Finding(
+    "RESPONSE-NONE",
+    "`response: null`: neither the deployed shape nor the indentation is predicted; `fabctl deploy` will refuse the "
+    "design, simulated rigs and scanners have no shape of it, and nothing measured is held against a prediction",
+    "info",
+    hint="leave `response` out for the predicted shape and curve",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +100,7 @@ def _inputs_of(
         spec = changed(spec, flatten=changed(spec.flatten, boundary_u=rim_u_through(mesh, rows[:, :3], rows[:, 3])))
     file = library or library_file(config, beside)
     cells = library_of(config, file).scaled(sheet)
+    findings += [] if config.response else [UNPREDICTED]
     return Inputs(spec, keeping("library", file, text), mesh, cells, presets, tuple(findings))
 
 

@@ -8,6 +8,7 @@ reply.
 from __future__ import annotations
 
 import logging
+import socket
 import struct
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +17,7 @@ from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from drivers.errors import DeviceRefused, DeviceTimeout, TransportError
 from drivers.rig.registers import BadReply, Table
+from drivers.transport.tcp import claim, why
 
 # pymodbus logs what it also raises; said once, by us, is enough.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
@@ -76,12 +78,12 @@ class ModbusBus:
     """A pymodbus client held to the rules at the head of this file."""
 
     def __init__(
-        self, url: str, client: Any, unit: int, timeout_s: float, response_max_s: float, serial_line: bool
+        self, url: str, client: Any, unit: int, timeout_s: float, response_max_s: float, sign: socket.socket | None
     ) -> None:
-        self.url = url
+        self.url, self._sign = url, sign
         self._client, self._unit = client, unit
         self._timeout_s, self._response_max_s = timeout_s, response_max_s
-        self._serial = serial_line
+        self._serial = sign is None  # a serial port is locked itself
         self.drained_bytes_count = 0
 
     def read(self, table: Table, address: int, count: int) -> list[int]:
@@ -116,8 +118,10 @@ class ModbusBus:
         return self._registers(what, reply, count)
 
     def close(self) -> None:
-        """Close the line."""
+        """Close the line, and give the rig free."""
         self._client.close()
+        if self._sign is not None:
+            self._sign.close()
 
     def _ask(self, what: str, function: int, ask: Callable[[], Any]) -> Any:
         from pymodbus.exceptions import ConnectionException, ModbusException
@@ -157,16 +161,16 @@ class ModbusBus:
             self._client.close()  # the next request says that the line is gone
 
     def _throw_away(self, wait_s: float) -> int:
-        socket = self._client.socket
+        line = self._client.socket
         if self._serial:
-            socket.timeout = wait_s
+            line.timeout = wait_s
             try:
-                return len(socket.read(max(1, socket.in_waiting)))
+                return len(line.read(max(1, line.in_waiting)))
             finally:
-                socket.timeout = self._timeout_s
-        socket.settimeout(wait_s)
+                line.timeout = self._timeout_s
+        line.settimeout(wait_s)
         try:
-            got = socket.recv(4096)
+            got = line.recv(4096)
         except TimeoutError:
             return 0
         if not got:
@@ -185,16 +189,33 @@ def open_bus(url: str, timeout_s: float, response_max_s: float) -> ModbusBus:
         raise TransportError(url, str(fault)) from fault
     if options:
         raise TransportError(url, f"unknown option {', '.join(options)}", "known: unit, and for RTU baud, parity, stop")
+    sign = None if serial_line else _claimed(url, client.comm_params.host, client.comm_params.port)
     if serial_line:
         _probe(url, parts.path)
     if not client.connect():
+        if sign is not None:
+            sign.close()
         raise TransportError(url, "cannot be opened", "check the address, the cable and who else uses the port")
     if serial_line:
         # pyserial calls a write that took longer a broken line, though its bytes are out: a host that was held up.
         client.socket.write_timeout = max(timeout_s, WRITE_TIMEOUT_S)
     # By default pymodbus hangs up after a few lost replies; here the caller decides.
     client.set_max_no_responses(2**31)
-    return ModbusBus(url, client, unit, timeout_s, response_max_s, serial_line)
+    return ModbusBus(url, client, unit, timeout_s, response_max_s, sign)
+
+
+def _claimed(url: str, host: str, port: int) -> socket.socket:
+    """Return the sign that the rig at an address is ours; raise `TransportError` where another program has it.
+
+    Modbus serves several masters at once: without it two of them would move one stage.
+    """
+    sign = socket.socket(socket.AF_UNIX)
+    try:
+        claim(sign, host, port)
+    except OSError as fault:
+        sign.close()
+        raise TransportError(url, *why(fault)) from fault
+    return sign
 
 
 def _probe(url: str, port: str) -> None:
@@ -204,6 +225,8 @@ def _probe(url: str, port: str) -> None:
     try:
         serial.Serial(port, exclusive=True).close()
     except OSError as fault:
+        if "lock" in str(fault):
+            raise TransportError(url, "the port is in use by another program", "close it, or wait") from fault
         hint = "`ls -l /dev/serial/by-id/` lists the ports; only one program can have one"
         raise TransportError(url, fault.strerror or str(fault), hint) from fault
 

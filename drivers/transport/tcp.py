@@ -25,7 +25,7 @@ class TcpTransport:
             self._socket = socket.create_connection((host, port), timeout=CONNECT_S)
         except OSError as fault:
             self._claim.close()
-            raise TransportError(url, *_why(fault)) from fault
+            raise TransportError(url, *why(fault)) from fault
         self._socket.settimeout(WRITE_TIMEOUT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -70,7 +70,8 @@ def claim(sign: socket.socket, host: str, port: int) -> None:
         sign.bind(f"\0fabctl-device-{'loopback' if address.is_loopback else address}-{port}")
 
 
-def _why(fault: OSError) -> tuple[str, str]:
+def why(fault: OSError) -> tuple[str, str]:
+    """Return why a device cannot be claimed or connected to, and what to do."""
     if fault.errno == errno.EADDRINUSE:
         return "the device is in use by another program", "close the other sender"
     if isinstance(fault, TimeoutError):

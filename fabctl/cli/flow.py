@@ -33,7 +33,7 @@ from fabctl.flow import Flow, Order, continued, runner, steps_after_deployment, 
     type=click.FloatRange(0, 10, min_open=True),
     default=0.02,
     show_default=True,
-    help="Of the target's diagonal.",
+    help="How far 95 % of the area may lie off the target, as a fraction of its diagonal.",
 )
 @seed_option
 @bench_option
@@ -53,7 +53,7 @@ def command(
     """Take SPEC, a file or a name in configs/specs, through every room: design, cut, indent, scan, report.
 
     On a bench where a person deploys the sheet, flow stops after the cut with a checklist;
-    `--continue SPECIMEN` goes on.
+    `--continue SPECIMEN` goes on. The scan passes within 0.02 of the target's diagonal, or `--tolerance-frac`.
     """
     if (spec is None) == (specimen is None):
         raise click.UsageError("give either SPEC or --continue SPECIMEN")

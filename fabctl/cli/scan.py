@@ -30,7 +30,9 @@ unit_option = click.option(
     help="Millimetres in one unit of the cloud, with --scale known.",
 )
 tolerance_option = click.option(
-    "--tolerance-frac", type=click.FloatRange(0, 10, min_open=True), help="Of the bounding-box diagonal."
+    "--tolerance-frac",
+    type=click.FloatRange(0, 10, min_open=True),
+    help="Of the bounding-box diagonal; without it nothing is passed or failed.",
 )
 
 
@@ -348,8 +350,9 @@ def _sentence(body: dict[str, Any]) -> str:
     found = body.get("deviation")
     if found is None:
         return f"{body['status']}: " + "; ".join(f["message"] for f in body["findings"] if f["level"] == "error")
+    verdict = body["verdict"] + (" (--tolerance-frac)" if body["tolerance_frac"] is None else "")
     return (
-        f"{body['verdict']}: rms {found['rms_mm']:.3f} mm ({found['rms_frac']:.3%} of the diagonal), "
+        f"{verdict}: rms {found['rms_mm']:.3f} mm ({found['rms_frac']:.3%} of the diagonal), "
         f"95 % of the area within {found['p95_abs_mm']:.3f} mm"
     )
 

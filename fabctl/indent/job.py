@@ -93,7 +93,7 @@ def plan_test(
     steps = actions(read)
     findings = _nothing_to_press(specimen)
     if resume is not None:
-        findings += against_resuming(resume, specimen.name, read, bench)
+        findings += against_resuming(lab, resume, specimen.name, read, bench)
         steps = resumed(steps, curves_done(resume), points_without_contact(resume))
         if not steps:
             findings.append(Finding("METHOD-DONE", "every curve of that run is done", where=resume.run_id))

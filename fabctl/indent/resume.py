@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from design.findings import Finding
 from drivers.rig.indenter import Identity
@@ -12,7 +12,8 @@ from fabctl.bench import begun_elsewhere
 from fabctl.config.bench import BenchConfig
 from fabctl.config.method import MethodConfig
 from fabctl.indent.method import Action
-from fabctl.records.folder import RunFolder
+from fabctl.records.folder import RunFolder, open_run, status_of
+from fabctl.workspace import Workspace
 
 
 def resumed(
@@ -36,13 +37,23 @@ def _without_idle_rests(plan: Sequence[Action]) -> list[Action]:
 
 
 def curves_done(run: RunFolder) -> list[tuple[int, int]]:
-    """Return (point, curve) of every curve that a run finished, from its events."""
-    return [(data["point"], data["curve"]) for data in _told(run, "curve")]
+    """Return (point, curve) of every curve that a run, or one that it went on with, finished, from their events."""
+    return [(data["point"], data["curve"]) for link in _chain(run) for data in _told(link, "curve")]
 
 
 def points_without_contact(run: RunFolder) -> list[int]:
-    """Return the grid points at which a run met nothing, from its events."""
-    return [data["point"] for data in _told(run, "no_contact")]
+    """Return the grid points at which a run, or one that it went on with, met nothing, from their events."""
+    return [data["point"] for link in _chain(run) for data in _told(link, "no_contact")]
+
+
+def _chain(run: RunFolder) -> Iterator[RunFolder]:
+    """Yield a run, the one that it went on with, and so on back to the first."""
+    seen = set()
+    while run.run_id not in seen:
+        yield run
+        seen.add(run.run_id)
+        before = run.manifest().get("config", {}).get("resumes")
+        run = open_run(run.path.parent / str(before)) if before else run
 
 
 def _told(run: RunFolder, kind: str) -> list[dict[str, int]]:
@@ -56,7 +67,9 @@ def _told(run: RunFolder, kind: str) -> list[dict[str, int]]:
     return found
 
 
-def against_resuming(run: RunFolder, specimen: str, method: MethodConfig, bench: BenchConfig) -> list[Finding]:
+def against_resuming(
+    lab: Workspace, run: RunFolder, specimen: str, method: MethodConfig, bench: BenchConfig
+) -> list[Finding]:
     """Return what speaks against going on with `run`, as far as it is known before the rig is asked."""
     manifest = run.manifest()
     if manifest.get("kind") != "indent" or manifest.get("specimen") != specimen:
@@ -67,7 +80,21 @@ def against_resuming(run: RunFolder, specimen: str, method: MethodConfig, bench:
     outcome = run.outcome()
     if outcome is not None and outcome["status"] == "done":
         found.append(Finding("RESUME-DONE", f"{run.run_id} came to its end"))
-    return found
+    return found + _gone_on_with(lab, run, specimen)
+
+
+def _gone_on_with(lab: Workspace, run: RunFolder, specimen: str) -> list[Finding]:
+    """Say which later runs went on with `run` already; one that pressed no curve to its end may be tried again."""
+    return [
+        Finding(
+            "RESUME-TWICE",
+            f"{run.run_id} has already been gone on with, in {later.run_id} ({status_of(later)})",
+            hint=f"go on with that one: --resume {later.run_id}",
+        )
+        for later in lab.runs_of(specimen, "indent")
+        if later.manifest().get("config", {}).get("resumes") == run.run_id
+        and (_told(later, "curve") or _told(later, "no_contact") or status_of(later) == "running")
+    ]
 
 
 def on_another_rig(run: RunFolder, identity: Identity) -> list[Finding]:

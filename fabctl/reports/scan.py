@@ -50,7 +50,8 @@ def sentence_of(body: dict[str, Any]) -> str:
     )
     model = body.get("against_predicted")
     if model:
-        text += f" Against the predicted shape it is {model['rms_mm']:.2f} mm ({percent(model['rms_frac'], 2)})."
+        share = percent(model["rms_mm"] / found["diagonal_mm"], 2)  # of the target's diagonal, like all others
+        text += f" Against the predicted shape it is {model['rms_mm']:.2f} mm ({share})."
     return text
 
 
@@ -69,7 +70,7 @@ def scan_report(run: RunFolder) -> Report:
             f"{percent(body['share_within_required_frac'], 0)} is asked"
         )
     elif found is not None:
-        reasons.append("no tolerance was given, so nothing is passed or failed")
+        reasons.append("no tolerance was given (`--tolerance-frac`), so nothing is passed or failed")
     reasons += [f["message"] for f in body.get("findings", []) if f["level"] != "info"]
     steps = [scan_step(run), _alignment_step(body)] + ([_cleaning_step(run, body)] if found is not None else [])
     return Report(
@@ -132,7 +133,7 @@ def deviation_facts(body: dict[str, Any]) -> tuple[Fact, ...]:
         Fact("target seen", percent(found["coverage_frac"]), "of its area"),
         Fact("points compared", f"{found['points_count']:,}"),
         Fact("left out", f"{found['border_count']:,} past the border, {found['lone_count']:,} wrong matches"),
-        Fact("bounding-box diagonal", f"{size:.2f} mm"),
+        Fact("bounding-box diagonal", f"{size:.2f} mm", "of the target"),
     ]
     model = body.get("against_predicted")
     if model:

@@ -43,7 +43,7 @@ def specimen_report(lab: Workspace, specimen: Specimen) -> Report:
     name = _design_name(specimen)
     return Report(
         title=f"Specimen {specimen.name} · {name}",
-        subtitle=f"Made {clock(str(record['made_utc']))}",
+        subtitle=f"Specimen made {clock(str(record['made_utc']))}",
         word=word,
         sentence=sentence,
         reasons=tuple(reasons),
@@ -85,7 +85,8 @@ def verdict(latest: dict[str, RunFolder]) -> tuple[Word, str, list[str]]:
     size = f"RMS deviation {deviation['rms_mm']:.2f} mm, {percent(deviation['rms_frac'], 2)} of the diagonal"
     tolerance = scan.get("tolerance_frac")
     if tolerance is None:
-        return "incomplete", f"{size}; no tolerance was given to hold it against.", []
+        advice = "compare again with `fabctl scan run … --tolerance-frac 0.02`, say, for a pass or a fail"
+        return "incomplete", f"{size}; no tolerance was given to hold it against.", [advice]
     asked = percent(scan["share_within_required_frac"], 0)
     share = f"{asked} of the area must lie within ± {percent(tolerance, 2)} of the diagonal"
     if (within := scan.get("within_tolerance_frac")) is not None:

@@ -163,14 +163,14 @@ def write_bar(path: Path, span_mm: float, diagonal_mm: float) -> None:
         for k, (r, g, b) in enumerate(STOPS)
     )
     ticks = "".join(
-        f'<text x="{20 + 520 * (t + 1) / 2:.0f}" y="32" text-anchor="middle">{t * span_mm:+.3g} mm</text>'
-        f'<text x="{20 + 520 * (t + 1) / 2:.0f}" y="46" text-anchor="middle" fill="#666d76">'
+        f'<text x="{40 + 480 * (t + 1) / 2:.0f}" y="32" text-anchor="middle">{t * span_mm:+.3g} mm</text>'
+        f'<text x="{40 + 480 * (t + 1) / 2:.0f}" y="46" text-anchor="middle" fill="#666d76">'
         f"{100 * t * span_mm / diagonal_mm:+.2g} %</text>"
-        for t in (-0.9, -0.5, 0.0, 0.5, 0.9)
+        for t in (-1.0, -0.5, 0.0, 0.5, 1.0)
     )
     path.write_text(
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 560 52" width="560" font-size="11" '
         f'font-family="system-ui, sans-serif"><defs><linearGradient id="g">{stops}</linearGradient></defs>'
-        f'<rect x="20" y="4" width="520" height="14" fill="url(#g)" stroke="#888"/>{ticks}</svg>',
+        f'<rect x="40" y="4" width="480" height="14" fill="url(#g)" stroke="#888"/>{ticks}</svg>',
         encoding="utf-8",
     )

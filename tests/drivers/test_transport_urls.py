@@ -10,6 +10,7 @@ import socket
 import pytest
 
 from drivers.errors import TransportError
+from drivers.rig.bus import open_bus
 from drivers.transport import open_transport
 
 
@@ -76,3 +77,29 @@ def test_a_connection_that_fails_leaves_the_device_free() -> None:
     for _ in range(2):
         with pytest.raises(TransportError, match="refused"):
             open_transport(url)
+
+
+def test_a_rig_in_use_over_tcp_is_not_even_connected_to_and_free_afterwards() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with contextlib.closing(open_bus(f"modbus-tcp://127.0.0.1:{port}?unit=1", 0.2, 0.1)):
+            server.accept()[0].close()
+            with pytest.raises(TransportError, match="in use"):
+                open_bus(f"modbus-tcp://localhost:{port}?unit=2", 0.2, 0.1)
+            assert not select.select([server], [], [], 0)[0]
+        open_bus(f"modbus-tcp://localhost:{port}", 0.2, 0.1).close()
+    for _ in range(2):
+        with pytest.raises(TransportError, match="cannot be opened"):
+            open_bus(f"modbus-tcp://127.0.0.1:{port}", 0.2, 0.1)
+
+
+def test_a_rig_on_a_serial_line_in_use_is_not_opened_and_free_afterwards() -> None:
+    master, slave = os.openpty()
+    url = f"modbus-rtu://{os.ttyname(slave)}?baud=115200&parity=N"
+    try:
+        with contextlib.closing(open_bus(url, 0.2, 0.1)), pytest.raises(TransportError, match="in use"):
+            open_bus(url, 0.2, 0.1)
+        open_bus(url, 0.2, 0.1).close()
+    finally:
+        os.close(master)
+        os.close(slave)

@@ -77,6 +77,14 @@ def test_a_smaller_cell_scales_slit_and_hinge_and_overrides_the_file(tmp_path: P
     assert inputs.spec.hinge is not None and inputs.spec.hinge.width_mm == pytest.approx(0.125)
 
 
+@pytest.mark.parametrize("text", [SPEC, SPEC.replace("response: null\n", "")])
+def test_a_specification_without_a_response_is_told_what_then_is_missing(text: str, tmp_path: Path) -> None:
+    (tmp_path / "spec.yaml").write_text(text)
+    told = [f for f in read_inputs(str(tmp_path / "spec.yaml"), tmp_path).findings if f.code == "RESPONSE-NONE"]
+    assert len(told) == ("null" in text)
+    assert all(f.level == "info" and "deployed shape" in f.message for f in told)
+
+
 def test_a_name_that_is_a_specification_is_checked_as_it_would_be_built(tmp_path: Path) -> None:
     (tmp_path / "configs/specs").mkdir(parents=True)
     (tmp_path / "configs/specs/mine.yaml").write_text(SPEC.replace("small-cap", "mine") + "cell_mm: 8\n")

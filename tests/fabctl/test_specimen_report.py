@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ import pytest
 from fabctl.records.folder import RunFolder, start_run
 from fabctl.reports.indent_step import indent_step
 from fabctl.reports.page import render
+from fabctl.reports.scan import sentence_of
 from fabctl.reports.specimen import specimen_report, telling, verdict
+from fabctl.scan.pictures import write_bar
 from fabctl.workspace import Specimen, Workspace
 
 SCAN: dict[str, Any] = {
@@ -82,6 +85,14 @@ def test_the_verdict_follows_the_scan(lab: Workspace, specimen: Specimen, change
     assert verdict(telling(lab.runs_of("S-0001")))[0] == word
 
 
+def test_a_scan_without_a_tolerance_says_which_option_gives_one(lab: Workspace, specimen: Specimen) -> None:
+    for kind, result in (("cut", {}), ("indent", {}), ("scan", SCAN | {"tolerance_frac": None})):
+        run(lab, kind, "done", result)
+    word, _, reasons = verdict(telling(lab.runs_of("S-0001")))
+    assert word == "incomplete"
+    assert "--tolerance-frac" in reasons[0]
+
+
 def test_text_from_outside_cannot_become_markup(lab: Workspace, specimen: Specimen) -> None:
     run(lab, "cut", "failed", {}, "<script>alert(1)</script>")
     assert "<script>alert" not in render(specimen_report(lab, specimen))
@@ -116,3 +127,21 @@ def test_a_real_bench_is_not_called_simulated(lab: Workspace, specimen: Specimen
         "done"
     )
     assert "imulated" not in specimen_report(lab, specimen).sentence
+
+
+def test_the_scan_against_the_prediction_is_told_in_fractions_of_the_targets_diagonal() -> None:
+    body: dict[str, Any] = {
+        "deviation": {"rms_mm": 0.5, "rms_frac": 0.0025, "p95_abs_mm": 0.9, "diagonal_mm": 200.0},
+        "against_predicted": {"rms_mm": 0.36, "rms_frac": 0.0017, "diagonal_mm": 212.0},
+    }
+    assert sentence_of(body).endswith("0.36 mm (0.18 %).")
+
+
+def test_the_bar_of_colours_is_named_at_its_ends(tmp_path: Path) -> None:
+    write_bar(tmp_path / "bar.svg", 2.0, 200.0)
+    drawn = (tmp_path / "bar.svg").read_text()
+    bar = re.search(r'<rect x="(\d+)" y="4" width="(\d+)"', drawn)
+    assert bar is not None
+    left, right = int(bar[1]), int(bar[1]) + int(bar[2])
+    assert f'x="{left}" y="32" text-anchor="middle">-2 mm' in drawn
+    assert f'x="{right}" y="32" text-anchor="middle">+2 mm' in drawn

@@ -60,12 +60,33 @@ class Lab:
         path.write_text(method)
         return plan_test(self.place, self.specimen, str(path), bench, resume)
 
+    def broken_off(self, resume: RunFolder | None = None) -> RunFolder:
+        """Test until a curve is done, stop there, and return the run; the stage is drawn back by hand."""
+        told: list[str] = []
+        steering = Steering(lambda: "stop" if "curve" in told else "go")
+        with pytest.raises(Stopped):
+            run_test(
+                self.place,
+                self.plan(resume=resume),
+                Bench(BENCH, self.place.root),
+                lambda event: told.append(event.kind),
+                steering,
+                self.bus,
+            )
+        self.device.axis.position_mm = 0.2
+        (run,) = [run for run in self.place.all_runs() if run.manifest()["config"]["resumes"] == _id(resume)]
+        return run
+
     def test(self, plan: IndentPlan, wish: Wish = "go", bench: BenchConfig = BENCH) -> RunFolder:
         at = Bench(bench, self.place.root)
         return run_test(self.place, plan, at, _unheard, Steering(lambda: wish), self.bus)
 
     def newest(self) -> RunFolder:
         return self.place.runs_of(self.specimen.name, "indent")[-1]
+
+
+def _id(run: RunFolder | None) -> str | None:
+    return None if run is None else run.run_id
 
 
 def _unheard(_event: Event) -> None: ...
@@ -171,3 +192,18 @@ def test_a_clearance_beyond_the_travel_is_refused_and_a_secant_that_no_load_reac
     shallow = lab.plan(METHOD.replace("depth_mm: 2.6", "depth_mm: 1.6"))
     assert "METHOD-SECANT" in codes(shallow.findings)
     assert "METHOD-SECANT" not in codes(lab.plan().findings)
+
+
+def test_a_resume_of_a_resumed_test_repeats_no_curve_and_no_test_is_gone_on_with_twice(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method = METHOD.replace("cycles_count: 2", "cycles_count: 4")
+    monkeypatch.setattr(Lab.plan, "__defaults__", (method, BENCH, None))
+    first = lab.broken_off()
+    second = lab.broken_off(first)
+    third = lab.plan(resume=second)
+    refuse(third)
+    assert {action.curve for action in third.actions if action.curve} == {3, 4}
+    (found,) = [f for f in lab.plan(resume=first).findings if f.level == "error"]
+    assert (found.code, second.run_id in found.message) == ("RESUME-TWICE", True)
+    assert found.hint == f"go on with that one: --resume {second.run_id}"
