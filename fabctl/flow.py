@@ -23,6 +23,7 @@ from fabctl.bench import HELD, Bench
 from fabctl.config.bench import BenchConfig
 from fabctl.errors import BUG, DONE, OPERATOR, OUT_OF_TOLERANCE, FabctlError, UsageError
 from fabctl.events import Emit, Event
+from fabctl.records.ending import TETHER, heard
 from fabctl.workspace import Specimen, Workspace
 
 Run = Callable[[Sequence[str]], tuple[int, dict[str, Any]]]
@@ -41,7 +42,7 @@ class StepFailed(FabctlError):
 
 
 class _Terminated(BaseException):
-    """SIGTERM came to flow alone and must be handed on."""
+    """SIGTERM or SIGHUP came to flow alone and must be handed on."""
 
 
 @dataclass
@@ -114,12 +115,13 @@ def runner(lab: Workspace, bench: Bench) -> Run:
         path = os.pathsep.join(filter(None, [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH")]))
         with (
             _term_raises(),
+            _tether() as end,
             subprocess.Popen(
                 command,
                 stdout=subprocess.PIPE,
                 text=True,
-                env={**os.environ, "PYTHONPATH": path, HELD: str(bench.lock)},
-                pass_fds=(bench.lock,),
+                env={**os.environ, "PYTHONPATH": path, HELD: str(bench.lock), TETHER: str(end)},
+                pass_fds=(bench.lock, end),
             ) as process,
         ):
             said = _wait(process)
@@ -154,11 +156,23 @@ def _term_raises() -> Iterator[None]:
     def raise_it(_signal: int, _frame: FrameType | None) -> None:
         raise _Terminated
 
-    before = signal.signal(signal.SIGTERM, raise_it)
+    before = {kind: signal.signal(kind, raise_it) for kind in heard() if kind != signal.SIGINT}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
+
+
+@contextlib.contextmanager
+def _tether() -> Iterator[int]:
+    """Yield the reading end of a pipe that closes when flow dies, however it does: its step then stops by itself."""
+    end, held = os.pipe()
+    try:
+        yield end
+    finally:
+        os.close(end)
+        os.close(held)
 
 
 def _step(flow: Flow, name: str, words: Sequence[str], run: Run, emit: Emit, hint: str) -> dict[str, Any]:

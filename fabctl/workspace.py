@@ -101,19 +101,27 @@ class Workspace:
         raise UsageError(f"{name!r} may be any of {', '.join(sorted(p.name for p in matches))}")
 
     def all_runs(self) -> list[RunFolder]:
-        """Return every readable run, oldest first."""
-        found = []
-        for path in sorted(self.runs.glob("*-*-*")) if self.runs.is_dir() else []:
-            try:
-                found.append(open_run(path))
-            except RecordError:
-                continue  # half made: `fabctl run list` names these separately
-        return found
+        """Return every readable run, oldest first; `unreadable_runs` are the others."""
+        return [run for run in map(_readable, self._run_folders()) if run is not None]
+
+    def unreadable_runs(self) -> list[Path]:
+        """Return every run folder, half made or damaged, whose manifest cannot be read, oldest first."""
+        return [path for path in self._run_folders() if _readable(path) is None]
+
+    def _run_folders(self) -> list[Path]:
+        return sorted(self.runs.glob("*-*-*")) if self.runs.is_dir() else []
 
     def runs_of(self, specimen: str, kind: str | None = None) -> list[RunFolder]:
         """Return the runs of one specimen, oldest first."""
         wanted = [run for run in self.all_runs() if run.manifest().get("specimen") == specimen]
         return [run for run in wanted if kind is None or run.manifest().get("kind") == kind]
+
+
+def _readable(path: Path) -> RunFolder | None:
+    try:
+        return open_run(path)
+    except RecordError:
+        return None
 
 
 def _begins_or_ends(whole: str, part: str) -> bool:

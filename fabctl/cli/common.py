@@ -12,7 +12,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, TextIO, TypeVar
 
 import click
 
@@ -20,6 +20,7 @@ from fabctl.cli.paths import config_names
 from fabctl.cli.refusal import answer_no, exit_code_of, no_in_words, plain, refusal, sentence_of
 from fabctl.errors import BUG, DONE, OPERATOR, Stopped
 from fabctl.events import Emit, Event
+from fabctl.records.ending import INTERRUPTS, end_with_parent, heard
 from fabctl.workspace import Workspace, workspace
 
 TOGETHER_S = 0.5  # signals nearer than that are one
@@ -55,13 +56,29 @@ def lab() -> Workspace:
 def say(text: str = "") -> None:
     """Tell the person something; standard error, so that standard output stays for results."""
     _clear_line()
-    click.echo(text, err=True)
+    tell(text)
+
+
+def tell(text: str, nl: bool = True) -> None:
+    """Write to standard error; where nobody reads it any more, this and all that follows is lost, and no job ends."""
+    try:
+        click.echo(text, err=True, nl=nl)
+    except OSError:
+        _mute(sys.stderr)
+
+
+def _mute(stream: TextIO) -> None:
+    """Let what is written to `stream` go nowhere from now on."""
+    with contextlib.suppress(OSError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def _clear_line() -> None:
     """Take away what a live line of progress has left: its cursor waits at the line's beginning."""
     if sys.stderr.isatty():
-        click.echo(ERASE_TO_END, err=True, nl=False)
+        tell(ERASE_TO_END, nl=False)
 
 
 def say_keys(text: str) -> None:
@@ -76,15 +93,23 @@ def show(data: dict[str, Any], as_json: bool, lines: Iterable[str], code: int = 
     A result that is a no ends the command with `code`, and the object says so: `error` is `why`, `exit_code` the code.
     """
     if as_json:
-        click.echo(_json(data if code == DONE else answer_no(data, code, why)))
+        _print(_json(data if code == DONE else answer_no(data, code, why)))
         for line in no_in_words(data, why) if code != DONE else ():
             say(line)
     else:
         _clear_line()
         for line in lines:
-            click.echo(line)
+            _print(line)
     if code != DONE:
         click.get_current_context().exit(code)
+
+
+def _print(text: str) -> None:
+    """Print a result; a reader that has gone away (`| head`) changes neither what was done nor the exit code."""
+    try:
+        click.echo(text)
+    except BrokenPipeError:
+        _mute(sys.stdout)
 
 
 def _json(data: dict[str, Any]) -> str:
@@ -119,12 +144,12 @@ def progress() -> Emit:
         if event.kind == "progress" and event.done_frac is not None:
             text = f"{event.done_frac:6.1%}  {event.message}"
             if live:
-                click.echo(f"{ERASE_TO_END}{text}\r", err=True, nl=False)
+                tell(f"{ERASE_TO_END}{text}\r", nl=False)
             elif int(event.done_frac * 10) != tenth[0]:
-                click.echo(text, err=True)
+                tell(text)
             tenth[0] = int(event.done_frac * 10)
         elif event.kind == "progress" and live:  # how far is not known, only that it goes on
-            click.echo(f"{ERASE_TO_END}        {event.message}\r", err=True, nl=False)
+            tell(f"{ERASE_TO_END}        {event.message}\r", nl=False)
         elif event.kind in ("stage", "state", "warning", "finding"):
             say(event.message)
 
@@ -155,8 +180,9 @@ def run_to_the_end(command: click.Command) -> int:
     A second Ctrl-C may come at any moment of the way out: it must not change the exit code.
     """
     hear = _interrupted_once()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in heard():
         signal.signal(number, hear)
+    end_with_parent()
     try:
         try:
             return run_guarded(command)
@@ -168,7 +194,7 @@ def run_to_the_end(command: click.Command) -> int:
 
 
 def _deafen() -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in INTERRUPTS:
         signal.signal(number, signal.SIG_IGN)
 
 
@@ -178,7 +204,7 @@ def run_guarded(command: click.Command) -> int:
         code = command.main(prog_name="fabctl", standalone_mode=False)
         return int(code) if isinstance(code, int) else DONE
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _mute(sys.stdout)
         return DONE
     except (Exception, KeyboardInterrupt) as fault:  # noqa: BLE001 - the outermost door: what is not known is a bug
         return _report(fault)
@@ -188,15 +214,20 @@ def _report(fault: BaseException) -> int:
     """Tell a person on stderr and, where `--json` was asked for, a program on stdout; return the exit code."""
     code = exit_code_of(fault)
     if json_asked(sys.argv[1:]):
-        with contextlib.suppress(OSError):  # nobody listens any more, or the disk behind stdout is full
+        try:
             click.echo(_json(refusal(fault)))
+        except OSError:  # nobody listens any more, or the disk behind stdout is full
+            _mute(sys.stdout)
     if isinstance(fault, click.exceptions.Abort | KeyboardInterrupt):
         say("stopped")
     elif isinstance(fault, click.ClickException):
-        fault.show()
+        try:
+            fault.show()
+        except OSError:
+            _mute(sys.stderr)
     elif code == BUG:
         _clear_line()
-        traceback.print_exception(fault, file=sys.stderr)
+        tell("".join(traceback.format_exception(fault)), nl=False)
         say("fabctl: this is a bug in fabctl; please report it with the lines above")
     else:
         say(f"fabctl: {sentence_of(fault)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import shutil
@@ -11,8 +12,7 @@ import textwrap
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any
 
-import click
-
+from fabctl.cli.common import tell
 from fabctl.events import Emit, Event
 
 if TYPE_CHECKING:
@@ -52,7 +52,8 @@ class Keys:
         if self._terminal is not None:
             import termios
 
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._terminal)
+            with contextlib.suppress(termios.error):  # the terminal may be gone
+                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._terminal)
 
     def wish(self) -> Wish:
         """Return what the operator wants now."""
@@ -89,7 +90,7 @@ class Keys:
         if event.kind == "progress" and self._terminal is not None and sys.stderr.isatty():
             self._draw(event)
         else:
-            click.echo(self._erased(), err=True, nl=False)
+            tell(self._erased(), nl=False)
             self._listener(event)
 
     def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
@@ -97,7 +98,7 @@ class Keys:
             raise KeyboardInterrupt
         self._wish = "stop"
         self._drawn_rows = 0
-        click.echo("\nstopping; once more interrupts at once", err=True)
+        tell("\nstopping; once more interrupts at once")
 
     def _draw(self, event: Event) -> None:
         self._grow(event)
@@ -105,7 +106,7 @@ class Keys:
         columns, rows = min(PLOT_COLUMNS, size.columns - LABEL_COLUMNS), min(PLOT_ROWS, size.lines - OTHER_ROWS)
         plot = braille(self._curve, columns, rows) if len(self._curve) > 1 and columns > 9 and rows > 3 else []
         lines = [*plot, f"{event.done_frac or 0:6.1%}  {event.message}", *self._hints(size.columns - 1)]
-        click.echo(self._erased() + "".join(f"{line[: size.columns - 1]}\n" for line in lines), err=True, nl=False)
+        tell(self._erased() + "".join(f"{line[: size.columns - 1]}\n" for line in lines), nl=False)
         self._drawn_rows = len(lines)
 
     def _grow(self, event: Event) -> None:

@@ -29,7 +29,8 @@ def keyboard() -> Iterator[Callable[[], Wish]]:
     try:
         yield lambda: _pressed(handle)
     finally:
-        termios.tcsetattr(handle, termios.TCSADRAIN, before)
+        with contextlib.suppress(termios.error):  # the terminal may be gone
+            termios.tcsetattr(handle, termios.TCSADRAIN, before)
 
 
 def _pressed(handle: int) -> Wish:

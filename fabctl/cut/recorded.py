@@ -18,6 +18,7 @@ from fabctl.cut.trail import begins
 from fabctl.cut.wirelog import WireLog
 from fabctl.errors import FabctlError, RecordError, RefusedError, Stopped
 from fabctl.events import Emit, Event
+from fabctl.records.ending import heard as signals_heard
 from fabctl.records.folder import RunFolder, write_atomically
 
 
@@ -86,7 +87,9 @@ def _listener(run: RunFolder, laser: Laser, log: WireLog, emit: Emit, plan: CutP
 
 @contextmanager
 def one_interrupt(laser: Laser) -> Iterator[Callable[[bool], None]]:
-    """Let the first Ctrl-C or SIGTERM interrupt, and further ones only make `off` reset at once.
+    """Let the first Ctrl-C, SIGTERM or SIGHUP interrupt, and a Ctrl-C after it only make `off` reset at once.
+
+    (Other signals come twice by themselves: from the system to the whole group, and from a flow to its step.)
 
     An exception in the middle of making the machine safe, or of writing down how it was left, would undo both. The
     first, too, waits while the function that this yields has not been told to listen.
@@ -102,9 +105,9 @@ def one_interrupt(laser: Laser) -> Iterator[Callable[[bool], None]]:
             raised = True
             raise KeyboardInterrupt
 
-    def hear(_number: int, _frame: FrameType | None) -> None:
+    def hear(number: int, _frame: FrameType | None) -> None:
         nonlocal heard
-        laser.hurried = laser.hurried or heard
+        laser.hurried = laser.hurried or (heard and number == signal.SIGINT)
         heard = True
         interrupt_once()
 
@@ -113,7 +116,7 @@ def one_interrupt(laser: Laser) -> Iterator[Callable[[bool], None]]:
         listening = now
         interrupt_once()
 
-    before = {number: signal.signal(number, hear) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, hear) for number in signals_heard()}
     try:
         yield listen
     finally:

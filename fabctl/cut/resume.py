@@ -45,14 +45,16 @@ from fabctl.cut.preflight import preflight
 from fabctl.cut.program import Program, read_program
 from fabctl.cut.progress import Place
 from fabctl.cut.recorded import has_begun, how_to_go_on, recorded
-from fabctl.cut.trail import EXACT_MM, burnt_before_mm, last_seen, read_trail, rest_of, stopped_at
+from fabctl.cut.trail import EXACT_MM, PROGRAM_BEGINS, burnt_before_mm, last_seen, read_trail, rest_of, stopped_at
 from fabctl.cut.wirelog import WireLog
 from fabctl.errors import RefusedError, Stopped, UsageError
-from fabctl.events import Event
-from fabctl.records.folder import RunFolder, as_json, open_run, sha256, start_run, status_of
+from fabctl.events import Emit, Event
+from fabctl.records.folder import RunFolder, as_json, open_run, sha256, start_run, status_of, write_atomically
 from fabctl.workspace import Specimen, Workspace
 
 OFFSET_MM = 0.0005
+STAMP = len("2026-01-01T000000Z")  # of a run's id: when it began
+RESUMED_BY = "resumed-by.json"  # in the folder of the earlier run
 WHAT = "the cut cannot be resumed"
 
 
@@ -105,7 +107,8 @@ def resume(lab: Workspace, bench: Bench, order: CutOrder, path: Path, desk: Desk
                 if rest.will_home:
                     tell(Event("stage", "homing: the position was lost"))
                     laser.home()
-                result = execute(laser, rest.plan, order, laser_config(bench), Desk(desk.ask, tell, desk.keys), run)
+                at_desk = Desk(desk.ask, _claiming(before, run, tell), desk.keys)
+                result = execute(laser, rest.plan, order, laser_config(bench), at_desk, run)
             bench.lay(specimen.design)
             return CutDone(rest.plan, specimen, run, {**result, "resumed": before.run_id})
     finally:
@@ -122,14 +125,41 @@ def material_of(run: RunFolder) -> MaterialConfig:
 
 def against_resuming(lab: Workspace, before: RunFolder, specimen: Specimen, design: Path) -> list[Finding]:
     """Return why going on would burn a line twice, or cut another design than the one that was begun."""
+    found = _gone_on_with(lab, before, specimen)
+    if _identity(design) != _identity(specimen.design):
+        text = f"{before.run_id} cut {specimen.name} from another design than {design}"
+        found.append(Finding("RESUME-DESIGN", text, hint=f"fabctl cut run {specimen.design} --resume {before.run_id}"))
+    return found
+
+
+def _claiming(before: RunFolder, later: RunFolder, tell: Emit) -> Emit:
+    """Return `tell`, which before the program's first line writes down with `before` that `later` goes on with it.
+
+    What is burnt twice must not hang on the later run's record alone: that may be damaged, or lost.
+    """
+
+    def claim(event: Event) -> None:
+        tell(event)
+        if event.data.get("mark") == PROGRAM_BEGINS:
+            write_atomically(before.path / RESUMED_BY, as_json({"run": later.run_id}))
+
+    return claim
+
+
+def _gone_on_with(lab: Workspace, before: RunFolder, specimen: Specimen) -> list[Finding]:
+    """Return what says, or may say, that `before` has already been gone on with."""
     found = []
     for later in lab.runs_of(specimen.name, "cut"):
         if later.manifest()["config"].get("resumed") == before.run_id and has_begun(later):
             text = f"{before.run_id} has already been gone on with, in {later.run_id} ({status_of(later)})"
             found.append(Finding("RESUME-TWICE", text, hint=f"look at that run: fabctl run show {later.run_id}"))
-    if _identity(design) != _identity(specimen.design):
-        text = f"{before.run_id} cut {specimen.name} from another design than {design}"
-        found.append(Finding("RESUME-DESIGN", text, hint=f"fabctl cut run {specimen.design} --resume {before.run_id}"))
+    if not found and (before.path / RESUMED_BY).exists():
+        text = f"{before.run_id} has already been gone on with, says its {RESUMED_BY}"
+        found.append(Finding("RESUME-TWICE", text, hint="that file names the run that has burnt more of the sheet"))
+    for path in lab.unreadable_runs() if not found else ():
+        if path.name[:STAMP] >= before.run_id[:STAMP] and "-cut-" in path.name and (path / "wire.log").exists():
+            text = f"{path.name} cannot be read: it may have gone on with {before.run_id}"
+            found.append(Finding("RESUME-TWICE", text, hint=f"look at the sheet; if it did not, move {path} away"))
     return found
 
 

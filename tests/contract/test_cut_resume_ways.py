@@ -13,9 +13,10 @@ import pytest
 from benchmarks._laser_kills import missing_count, twice_mm
 from benchmarks._laser_rig import LAB, Rig
 from drivers.grbl.laser import Laser
-from fabctl.cut import job
+from fabctl.cut import job, resume
 from fabctl.cut.place import Affine
-from fabctl.errors import RefusedError, Stopped
+from fabctl.cut.resume import RESUMED_BY
+from fabctl.errors import RecordError, RefusedError, Stopped
 from fabctl.events import Event, silent
 from fabctl.records.folder import RunFolder, status_of
 from tests.contract.test_cut_resume_refusals import PROGRAM, Camera, Cut, board, cut
@@ -72,6 +73,39 @@ def test_a_resume_that_is_stopped_before_its_program_begins_can_be_tried_again(c
     assert missing_count(cut.rig, PROGRAM) == 0
     assert twice_mm(cut.rig, PROGRAM) < 0.5
     assert set(refusal(cut)) == {"RESUME-TWICE"}
+
+
+@pytest.mark.parametrize(
+    ("damaged", "lost"),
+    [
+        (["manifest.json"], []),
+        (["wire.log"], []),
+        (["manifest.json", "wire.log"], []),
+        (["manifest.json"], [RESUMED_BY]),
+    ],
+)
+def test_a_damaged_record_of_a_resume_lets_nothing_be_burnt_twice(
+    cut: Cut, damaged: list[str], lost: list[str]
+) -> None:
+    later = cut.resume(dry_run=False, yes=True).run
+    for name in damaged:
+        (later.path / name).write_text("")
+    for name in lost:
+        (cut.run.path / name).unlink()
+    assert set(refusal(cut)) == {"RESUME-TWICE"}
+
+
+def test_that_a_cut_is_gone_on_with_is_written_down_before_its_first_line(
+    cut: Cut, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, _content: str) -> None:
+        raise RecordError(f"{path}: cannot be written")
+
+    monkeypatch.setattr(resume, "write_atomically", refuse)
+    since = len(cut.rig.trace)
+    with pytest.raises(RecordError, match=RESUMED_BY):
+        cut.resume(dry_run=False, yes=True)
+    assert not any(point.power_frac for point in cut.rig.trace[since:])
 
 
 def test_a_resume_that_is_stopped_later_is_gone_on_with_itself(cut: Cut) -> None:

@@ -201,7 +201,7 @@ def test_a_port_in_use_or_missing_is_said(lab: Lab, tmp_path: Path) -> None:
     assert "no such port" in err
 
 
-@pytest.mark.parametrize("word", [signal.SIGTERM])  # Ctrl-C ends the cut in the test above
+@pytest.mark.parametrize("word", [signal.SIGTERM, signal.SIGHUP])  # Ctrl-C ends the cut in the test above
 def test_stopping_is_dark_and_recorded(lab: Lab, tmp_path: Path, word: signal.Signals) -> None:
     process = lab.start(*lab.cut(make_design(tmp_path / "design")))
     wait_for_tenth(process, 1)

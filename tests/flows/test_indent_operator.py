@@ -132,3 +132,36 @@ def test_a_test_that_was_broken_off_stands_where_it_is_and_goes_on_at_the_next_c
     whole = bench.fabctl("indent", "analyse", first.run_id)["groups"][first.run_id]["runs"][0]
     assert whole["status"] == status
     assert whole["result"]["stiffness_secant_N_mm"] == pytest.approx(0.5, rel=0.02)  # of what was kept
+
+
+FLOW = """
+import sys
+from pathlib import Path
+from fabctl.bench import open_bench
+from fabctl.config.bench import load_bench
+from fabctl.flow import runner
+from fabctl.workspace import Workspace
+
+lab = Workspace(Path(sys.argv[1]))
+with open_bench(lab, load_bench("bench.yaml", lab.root), "flow") as held:
+    print(runner(lab, held)(sys.argv[2:])[0])
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP])
+def test_a_step_whose_flow_dies_stops_by_itself(bench: SimulatedBench, number: signal.Signals) -> None:
+    command = [sys.executable, "-c", FLOW, str(bench.lab.root), *TEST]
+    flow = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=bench.lab.root, env=ENVIRONMENT
+    )
+    assert flow.stderr is not None
+    for line in flow.stderr:
+        if line.startswith("load"):
+            break
+    flow.send_signal(number)
+    flow.stderr.read()  # until the step, which has it too, has ended
+    flow.stderr.close()
+    flow.wait()
+    (run,) = bench.lab.runs_of("S-0001", "indent")
+    assert status_of(run) == "stopped"
+    assert _standing(bench)["state"] == "disarmed"

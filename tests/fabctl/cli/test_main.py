@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import subprocess
 import sys
@@ -15,7 +16,19 @@ from design.errors import MeshError
 from design.findings import Finding
 from drivers.errors import TransportError
 from fabctl.cli.common import run_guarded
-from fabctl.errors import BUG, DEVICE, DONE, OPERATOR, REFUSED, USAGE, BenchBusy, ConfigError, RefusedError, Stopped
+from fabctl.errors import (
+    BUG,
+    DEVICE,
+    DONE,
+    OPERATOR,
+    OUT_OF_TOLERANCE,
+    REFUSED,
+    USAGE,
+    BenchBusy,
+    ConfigError,
+    RefusedError,
+    Stopped,
+)
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -95,7 +108,7 @@ sys.exit(code)
 """
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 @pytest.mark.parametrize("early", [True, False])
 def test_a_second_interrupt_on_the_way_out_changes_no_exit_code(name: str, early: bool) -> None:
     done = subprocess.run(
@@ -123,6 +136,65 @@ def test_a_full_disk_behind_stdout_is_the_disks_fault() -> None:
     assert done.returncode == DEVICE
     assert "no space left" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+TALKING = """
+import signal, sys, click
+from fabctl.cli import common
+from fabctl.events import Event
+
+@click.command()
+def command():
+    sys.stdin.read()  # until the reader is gone
+    tell = common.progress()
+    for k in range(100):
+        tell(Event("progress", "line", k / 100))
+        tell(Event("stage", "stage"))
+    {before}
+    common.show({{"done": True}}, {as_json}, ["done"], common.DONE if {good} else 6, "too far off")
+
+sys.argv = ["fabctl"]
+sys.exit(common.run_to_the_end(command))
+"""
+
+
+def talk(out: int, err: int, close: int, **words: object) -> int:
+    """Run a job that talks after the reader of its pipe `close` is gone; return its exit code."""
+    line = [sys.executable, "-c", TALKING.format(**{"before": "", "as_json": True, "good": True, **words})]
+    process = subprocess.Popen(line, cwd=ROOT, stdin=subprocess.PIPE, stdout=out, stderr=err)
+    os.close(close)
+    process.communicate()
+    return process.returncode
+
+
+@pytest.mark.parametrize(("good", "code"), [(True, DONE), (False, OUT_OF_TOLERANCE)])
+def test_a_reader_of_progress_that_goes_away_ends_no_job(tmp_path: Path, good: bool, code: int) -> None:
+    reader, writer = os.pipe()
+    with (tmp_path / "out").open("w") as out:
+        assert talk(out.fileno(), writer, reader, good=good) == code
+    os.close(writer)
+    assert json.loads((tmp_path / "out").read_text())["done"]
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_readers_of_everything_that_go_away_change_no_exit_code(as_json: bool) -> None:
+    reader, writer = os.pipe()
+    assert talk(writer, writer, reader, good=False, as_json=as_json) == OUT_OF_TOLERANCE
+    os.close(writer)
+
+
+@pytest.mark.parametrize("before", ["raise common.Stopped('no')", "signal.raise_signal(signal.SIGHUP)"])
+def test_a_closed_terminal_or_a_stop_with_no_reader_is_still_the_operators(before: str) -> None:
+    reader, writer = os.pipe()
+    assert talk(writer, writer, reader, before=before) == OPERATOR
+    os.close(writer)
+
+
+def test_what_nohup_started_lives_through_a_hang_up() -> None:
+    script = TALKING.format(before="signal.raise_signal(signal.SIGHUP)", as_json=True, good=True)
+    line = ["nohup", sys.executable, "-c", script]
+    done = subprocess.run(line, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    assert done.returncode == DONE, done.stderr
 
 
 CLOSING = """
