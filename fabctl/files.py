@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 def bytes_of(path: Path, what: str) -> bytes:
     """Return the file's bytes; `what` says which file was expected, such as "a coupon's form"."""
+    if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would be waited for, a device has no end
+        raise UsageError(f"{path}: is no regular file; {what} was expected")
     try:
         found = path.read_bytes()
     except FileNotFoundError:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from fabctl.errors import RecordError, UsageError
+from fabctl.files import json_of
 from fabctl.records.folder import RunFolder, as_json, open_run, write_atomically
 
 SPECIMEN = re.compile(r"S-\d{4,}")
@@ -148,7 +149,7 @@ class Specimen:
     def is_coupon(self) -> bool:
         """Tell whether it is a coupon: flat patches to be pulled open by hand, no surface to press."""
         manifest = self.design / "manifest.json"
-        return manifest.is_file() and json.loads(manifest.read_text(encoding="utf-8")).get("kind") == "coupon"
+        return manifest.is_file() and json_of(manifest, "a design's manifest").get("kind") == "coupon"
 
     def record(self) -> dict[str, Any]:
         """Return what is written about the specimen."""

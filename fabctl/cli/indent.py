@@ -25,6 +25,7 @@ NAMED = (
     ("recovery", "recovery_ratio", ""),
 )
 HELD = (("relaxation", "relaxation_ratio", ""), ("creep", "creep_mm", "mm"))  # told only where a method holds
+LINES_TOLD_COUNT = 5
 WORDS = {name: words for words, name, _ in NAMED}
 
 
@@ -210,3 +211,6 @@ def _lines(result: dict[str, Any]) -> Iterator[str]:
             yield f"  {words:22} not found: {result.get('not_found', {}).get(name, 'no curve')}"
         else:
             yield f"  {words:22} {value:.4g} {unit}"
+    if bad := result.get("lines_left_out"):
+        which = ", ".join(map(str, bad[:LINES_TOLD_COUNT])) + (", …" if len(bad) > LINES_TOLD_COUNT else "")
+        yield f"  {'left out':22} {len(bad)} damaged row{'s' * (len(bad) > 1)} of samples.csv, line {which}"

@@ -24,7 +24,7 @@ PHOTOS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 class InFile(click.Path):
-    """A file to be read: it is there, no folder, allowed, and not empty."""
+    """A file to be read: it is there, a regular one, allowed, and not empty."""
 
     def __init__(self) -> None:
         super().__init__(exists=True, dir_okay=False, path_type=Path)
@@ -32,7 +32,9 @@ class InFile(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path; fail where there is nothing to read."""
         path = Path(str(super().convert(value, param, ctx)))
-        if path.is_file() and path.stat().st_size == 0:
+        if not path.is_file():
+            self.fail(f"'{value}' is no regular file.", param, ctx)
+        if path.stat().st_size == 0:
             self.fail(f"File '{value}' is empty.", param, ctx)
         return path
 

@@ -18,6 +18,7 @@ from fabctl.errors import UsageError
 from fabctl.files import json_of
 
 Origin = Literal["here", "home", "camera"]
+FARTHEST_MM = 10_000.0
 RIGID_RATIO = 0.02  # a camera map that stretches more than this is a mistake, not a bed
 
 
@@ -138,9 +139,13 @@ def read_affine(path: Path) -> Affine:
         raise UsageError(f"{path}: no sheet_to_machine of two rows with three numbers") from fault
     if not all(map(math.isfinite, (a, b, c, d, e, f))):
         raise UsageError(f"{path}: the map is not finite")
-    scale = math.sqrt(abs(a * e - b * d))
-    if not abs(scale - 1) <= RIGID_RATIO:
-        raise UsageError(f"{path}: the map scales by {scale:.4f}; a bed does not. Align it again")
+    if max(abs(c), abs(f)) > FARTHEST_MM:
+        raise UsageError(f"{path}: the map moves the sheet by more than {FARTHEST_MM / 1000:g} m. Align it again")
+    for scale in (math.hypot(a, d), math.hypot(b, e)):
+        if not abs(scale - 1) <= RIGID_RATIO:
+            raise UsageError(f"{path}: the map scales by {scale:.4f}; a bed does not. Align it again")
+    if not abs(a * b + d * e) <= RIGID_RATIO:
+        raise UsageError(f"{path}: the map shears, its axes are not at right angles; a bed's are. Align it again")
     return Affine(a, b, c, d, e, f)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +49,7 @@ class Samples:
     step: NDArray[np.str_]
     point: NDArray[np.int64]
     curve: NDArray[np.int64]
+    left_out: tuple[int, ...] = ()  # lines of the file that hold no sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +72,9 @@ def samples_of(run: RunFolder) -> Path:
 
 
 def read_samples(path: Path) -> Samples:
-    """Return the rows of a `samples.csv`; a last line that a kill cut short is left out."""
+    """Return the rows of a `samples.csv`; a last line that a kill cut short is left out, others that are none told."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as fault:
         raise RecordError(f"{path}: {fault.strerror or fault}") from fault
     lines = text.splitlines()
@@ -80,16 +82,31 @@ def read_samples(path: Path) -> Samples:
         raise RecordError(f"{path}: not a table of samples ({','.join(COLUMNS)})")
     if not text.endswith("\n"):
         lines.pop()
-    rows = list(csv.reader(lines[1:]))
-    column = {name: [row[k] for row in rows] for k, name in enumerate(COLUMNS)}
+    found = [_sample(line) for line in lines[1:]]
+    left_out = tuple(number for number, sample in enumerate(found, 2) if sample is None)
+    rows = [sample for sample in found if sample is not None]
     return Samples(
-        time_s=np.array(column["time_s"], dtype=np.float64),
-        position_mm=np.array(column["position_mm"], dtype=np.float64),
-        force_N=np.array(column["force_N"], dtype=np.float64),
-        step=np.array(column["step"], dtype=np.str_),
-        point=np.array(column["point"], dtype=np.int64),
-        curve=np.array(column["curve"], dtype=np.int64),
+        time_s=np.array([row[0] for row in rows], dtype=np.float64),
+        position_mm=np.array([row[1] for row in rows], dtype=np.float64),
+        force_N=np.array([row[2] for row in rows], dtype=np.float64),
+        step=np.array([row[3] for row in rows], dtype=np.str_),
+        point=np.array([row[4] for row in rows], dtype=np.int64),
+        curve=np.array([row[5] for row in rows], dtype=np.int64),
+        left_out=left_out,
     )
+
+
+def _sample(line: str) -> tuple[float, float, float, str, int, int] | None:
+    """Return time, position, force, step, point and curve of one row; None where the row is damaged."""
+    cells = line.split(",")
+    try:
+        row = dict(zip(COLUMNS, cells, strict=True))
+        numbers = float(row["time_s"]), float(row["position_mm"]), float(row["force_N"])
+        if all(map(math.isfinite, numbers)):
+            return *numbers, row["step"], int(row["point"]), int(row["curve"])
+    except ValueError:
+        pass
+    return None
 
 
 def strokes_of(samples: Samples) -> list[tuple[int, int, Strokes]]:
@@ -220,9 +237,11 @@ def summarise_run(run: RunFolder) -> dict[str, Any]:
     compliance = float(calibration.get("compliance_mm_N") or 0.0)
     gain = float(calibration.get("gain_ratio") or 1.0)
     secant = float(config.get("method", {}).get("secant_mm", 2.0))
-    found = analyse(read_samples(samples_of(run)), compliance, secant, gain)
+    samples = read_samples(samples_of(run))
+    found = analyse(samples, compliance, secant, gain)
     conditioning = conditioning_curves(run.manifest())
     body = summarised(found, conditioning)
+    body["lines_left_out"] = list(samples.left_out)
     body |= {"compliance_mm_N": compliance, "gain_ratio": gain, "secant_mm": secant}
     write_curves(run.artefact("curves.csv"), found)
     counted = [n for n in found if (n.point, n.curve) not in set(conditioning)]

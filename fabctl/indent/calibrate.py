@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -136,21 +135,21 @@ def calibrate_force(
     clock: Clock | None = None,
 ) -> tuple[RunFolder, dict[str, Any]]:
     """Calibrate the load cell, keep the record, and make it the bench's current one."""
+    before = load_calibration(lab, bench.name) or Calibration()
     asked = {"what": "force", "masses_kg": list(masses_kg), "bench": bench.model_dump(mode="json")}
     run = start_run(lab / "runs", "calibrate", config=asked)
     with outcome_kept(run):
         body = force_result(read_masses(rig, masses_kg, put_on, clock or WallClock(), emit))
         run.write_result(body)
         run.finish("done")
-    known = replace(
-        load_calibration(lab, bench.name) or Calibration(),
-        gain_ratio=body["gain_ratio"],
-        gain_se_ratio=body["gain_se_ratio"],
-        force_run=run.run_id,
-        force_utc=datetime.now(UTC).isoformat(),
-        force_valid_days_count=valid_days_count,
-    )
-    save_calibration(lab, bench.name, known)
+    found = {
+        "gain_ratio": body["gain_ratio"],
+        "gain_se_ratio": body["gain_se_ratio"],
+        "force_run": run.run_id,
+        "force_utc": datetime.now(UTC).isoformat(),
+        "force_valid_days_count": valid_days_count,
+    }
+    save_calibration(lab, bench.name, before.model_copy(update=found))
     return run, body
 
 
@@ -166,25 +165,24 @@ def calibrate_frame(
     clock: Clock | None = None,
 ) -> tuple[RunFolder, dict[str, Any]]:
     """Press a rigid block, keep the record, and make its compliance the bench's current one."""
+    before = load_calibration(lab, bench.name) or Calibration()
     method = frame_method(config, force_N)
     asked = {"what": "frame", "method": method.model_dump(), "bench": bench.model_dump(mode="json")}
     run = start_run(lab / "runs", "calibrate", config=asked)
-    before = load_calibration(lab, bench.name) or Calibration()
     with outcome_kept(run):
         with contextlib.closing(Recorder(run.path / "samples.csv")) as recorder:
             Runner(rig, method, actions(method), recorder, clock or WallClock(), config.sample_hz, emit).execute()
         body = frame_result(run.path / "samples.csv", before.gain_ratio or 1.0, block_mm_N)
         run.write_result(body)
         run.finish("done")
-    known = replace(
-        before,
-        compliance_mm_N=body["compliance_mm_N"],
-        compliance_se_mm_N=body["compliance_se_mm_N"],
-        frame_run=run.run_id,
-        frame_utc=datetime.now(UTC).isoformat(),
-        frame_valid_days_count=valid_days_count,
-    )
-    save_calibration(lab, bench.name, known)
+    found = {
+        "compliance_mm_N": body["compliance_mm_N"],
+        "compliance_se_mm_N": body["compliance_se_mm_N"],
+        "frame_run": run.run_id,
+        "frame_utc": datetime.now(UTC).isoformat(),
+        "frame_valid_days_count": valid_days_count,
+    }
+    save_calibration(lab, bench.name, before.model_copy(update=found))
     return run, body
 
 

@@ -6,17 +6,18 @@ because somebody calibrated later.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator, Field
 
 from design.findings import Finding
-from fabctl.errors import RecordError
+from fabctl.config.loader import Model, load
+from fabctl.errors import ConfigError
 from fabctl.records.folder import as_json, write_atomically
 
 VALID_DAYS = 365
@@ -35,21 +36,33 @@ class Line:
     degrees_count: int
 
 
-@dataclass(frozen=True, slots=True)
-class Calibration:
+def _dated(text: str) -> str:
+    when = datetime.fromisoformat(text)
+    if when.tzinfo is None or when > datetime.now(UTC) + timedelta(days=1):
+        raise ValueError("a date in the past with its offset from UTC was expected")
+    return text
+
+
+Utc = Annotated[str, AfterValidator(_dated)]
+Gain = Annotated[float, Field(gt=0.5, lt=2)]
+NotNegative = Annotated[float, Field(ge=0)]
+Days = Annotated[int, Field(ge=1, le=36_500)]
+
+
+class Calibration(Model):
     """What is known of a rig. `gain_ratio` is shown over true force; both figures have a standard error and a date."""
 
-    gain_ratio: float | None = None
-    gain_se_ratio: float | None = None
+    gain_ratio: Gain | None = None
+    gain_se_ratio: NotNegative | None = None
     force_run: str | None = None
-    force_utc: str | None = None
-    compliance_mm_N: float | None = None
-    compliance_se_mm_N: float | None = None
+    force_utc: Utc | None = None
+    compliance_mm_N: NotNegative | None = None
+    compliance_se_mm_N: NotNegative | None = None
     frame_run: str | None = None
-    frame_utc: str | None = None
-    valid_days_count: int = VALID_DAYS
-    force_valid_days_count: int | None = None  # each its own; None: as `valid_days_count` says
-    frame_valid_days_count: int | None = None
+    frame_utc: Utc | None = None
+    valid_days_count: Days = VALID_DAYS
+    force_valid_days_count: Days | None = None  # each its own; None: as `valid_days_count` says
+    frame_valid_days_count: Days | None = None
 
     def ends(self, word: Literal["force", "frame"]) -> datetime | None:
         """Return when the calibration of force or frame is past its date, None where there is none."""
@@ -62,7 +75,7 @@ class Calibration:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON."""
-        return asdict(self)
+        return self.model_dump()
 
     def findings(self, now: datetime | None = None) -> list[Finding]:
         """Return what is missing or past its date."""
@@ -114,15 +127,15 @@ def calibration_path(home: Path, bench: str) -> Path:
 
 
 def load_calibration(home: Path, bench: str) -> Calibration | None:
-    """Return the bench's calibration, or None where there is none."""
+    """Return the bench's calibration, None where there is none; raise `ConfigError` with all that is wrong in it."""
     path = calibration_path(home, bench)
-    if not path.is_file():
+    if not path.exists():
         return None
     try:
-        found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return Calibration(**found)
-    except (ValueError, TypeError) as fault:
-        raise RecordError(f"{path}: not a calibration: {fault}") from fault
+        return load(path, Calibration)
+    except ConfigError as fault:
+        way_out = f"put {path} away, then: {_hint('force')}, and {_hint('frame')}"
+        raise ConfigError([*fault.complaints, way_out]) from fault
 
 
 def save_calibration(home: Path, bench: str, calibration: Calibration) -> Path:

@@ -24,6 +24,7 @@ from fabctl.events import Event
 from fabctl.records.ending import undisturbed
 
 FORMAT = 1
+ENDS = ("done", "stopped", "failed", "refused")
 LIBRARIES = ("numpy", "scipy", "libigl", "pyserial", "pymodbus", "opencv-contrib-python-headless", "open3d", "ezdxf")
 
 
@@ -133,7 +134,11 @@ class RunFolder:
 
     def outcome(self) -> dict[str, Any] | None:
         """Return how it ended, or None for a run that is going on or was interrupted."""
-        return _read(self.path / "outcome.json") if (self.path / "outcome.json").exists() else None
+        path = self.path / "outcome.json"
+        found = _read(path) if path.exists() else None
+        if found is not None and found.get("status") not in ENDS:
+            raise RecordError(f"{path}: not how a run ended; put that file away, and the run counts as interrupted")
+        return found
 
     def log_events(self) -> Callable[[Event], None]:
         """Return a listener that writes events to `events.jsonl`, with the time they came."""

@@ -95,7 +95,7 @@ def _calibration_facts(known: Mapping[str, Any] | None, started: datetime | None
     """Return both calibrations with their uncertainty (k = 2) and date, flagged where the run began after it."""
     if known is None:
         return [Fact("calibration", "none", "forces as the controller shows them, the frame's give not taken off")]
-    calibration = Calibration(**known)
+    calibration = Calibration.model_construct(**known)  # as the run had it, whatever is asked of one today
     pairs: tuple[tuple[str, Literal["force", "frame"], float | None, float | None, str], ...] = (
         ("load cell's gain", "force", calibration.gain_ratio, calibration.gain_se_ratio, ""),
         ("frame's give", "frame", calibration.compliance_mm_N, calibration.compliance_se_mm_N, "mm/N"),

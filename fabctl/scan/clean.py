@@ -15,6 +15,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from design.findings import Finding
+from fabctl.errors import RefusedError
 from fabctl.scan.foreign import nearest
 
 Floats = NDArray[np.float64]
@@ -23,6 +25,7 @@ Mask = NDArray[np.bool_]
 
 FINE = 300  # cells along the diagonal of the robust box at first
 LEAST_PER_CELL = 1.7  # points a cell should hold, so that a neighbourhood says something about density
+LINE_RATIO = 1e-6  # of the length: thinner than the digits of any file
 SPARSE_RATIO = 0.12  # a cell with less than this part of the usual neighbourhood is stray
 JOIN_CELLS = 2.6  # cells nearer than this belong together
 TABLE_LEAST_FRAC = 0.12  # of all cells; smaller planes are not called a table
@@ -124,6 +127,8 @@ def find_table(cells: Cells, seed: int) -> Plane | None:
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
     good = length > 0
+    if not good.any():
+        return None
     normals, offsets = normals[good] / length[good, None], np.sum(normals[good] / length[good, None] * a[good], axis=1)
     near = np.abs(some @ normals.T - offsets) < cells.size_cu
     best = int(np.argmax(near.sum(axis=0)))
@@ -156,7 +161,10 @@ def table_top_cu(points: Floats, table: Plane, size: float) -> float:
 
 
 def clean(points: Floats, seed: int = 0) -> Cleaned:
-    """Return the cloud told apart; `points` as read, `(n, 3)`."""
+    """Return the cloud told apart; `points` as read, `(n, 3)`. Raises `RefusedError` where they are no surface."""
+    if _is_line(points):
+        line = Finding("SCAN-LINE", "all points lie on one straight line", hint="look at the file in a viewer")
+        raise RefusedError("the cloud cannot be compared", [line])
     cells = into_cells(points)
     table = find_table(cells, seed)
     top = 0.0 if table is None else table_top_cu(points, table, cells.size_cu)
@@ -170,6 +178,12 @@ def clean(points: Floats, seed: int = 0) -> Cleaned:
     cluster[core] = _clusters(cells.centre[core], JOIN_CELLS * cells.size_cu)
     parts = tuple(_parts(cells, cluster, table is not None))
     return Cleaned(cells, table, top, is_table, sparse, cluster, parts)
+
+
+def _is_line(points: Floats) -> bool:
+    """Tell whether nothing but rounding keeps the points off one line; no surface can be found in such."""
+    spread = np.linalg.svd(np.cov(points.T), compute_uv=False)
+    return bool(spread[1] <= LINE_RATIO**2 * spread[0])
 
 
 def _clusters(points: Floats, reach: float) -> Ints:

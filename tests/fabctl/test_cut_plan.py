@@ -367,3 +367,18 @@ def test_the_dark_end_of_a_stroke_is_made_up_for() -> None:
     out = with_lit_ends(lines, DYNAMICS)
     assert out[4] == "X10Y10.012"
     assert out[:4] == lines[:4]
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("[[1, 0, 1e308], [0, 1, 0]]", "10 m"), ("[[1, 0, 0], [0, 1, -1e5]]", "10 m"),
+        ("[[1e308, 0, 0], [0, 1e-308, 0]]", "scales"), ("[[1, 1, 0], [0, 1, 0]]", "scales"),
+        ("[[1, 0.5, 0], [0, 0.8660254, 0]]", "shears"),
+    ],
+)  # fmt: skip
+def test_a_map_that_no_bed_has_is_refused(tmp_path: Path, rows: str, said: str) -> None:
+    path = tmp_path / "map.json"
+    path.write_text(f'{{"sheet_to_machine": {rows}}}')
+    with pytest.raises(UsageError, match=said):
+        read_affine(path)

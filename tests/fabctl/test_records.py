@@ -168,6 +168,17 @@ def test_one_bad_record_does_not_hide_the_others(tmp_path: Path, outcome: str) -
     assert {row.run: row.status for row in rows(tmp_path)}[odd.run_id] == "broken"
 
 
+@pytest.mark.parametrize("outcome", ["{}", '{"status": null}', '{"status": ["done"]}', "[]", "{"])
+def test_a_damaged_outcome_is_told_as_that(tmp_path: Path, outcome: str) -> None:
+    run = start_run(tmp_path, "indent")
+    (run.path / "outcome.json").write_text(outcome)
+    for ask in (lambda: status_of(run), run.outcome):
+        with pytest.raises(RecordError, match=r"outcome\.json"):
+            ask()
+    (row,) = rows(tmp_path)
+    assert (row.status, "outcome.json" in row.message) == ("broken", True)
+
+
 def test_the_list_is_to_be_had_where_nothing_can_be_written(tmp_path: Path) -> None:
     run = start_run(tmp_path, "cut")
     run.finish("done")

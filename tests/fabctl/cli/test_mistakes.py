@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from fabctl.cli.refusal import exit_code_of, sentence_of
 def home(tmp_path: Path) -> Path:
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "manifest.json").write_text('{"format": 1, "files": {}}')
+    os.mkfifo(tmp_path / "folder" / "pipe.png")
     (tmp_path / "form.csv").write_text("patch\n")
     return tmp_path
 
@@ -25,6 +27,7 @@ def home(tmp_path: Path) -> Path:
     ("words", "code", "told"),
     [
         ("run show FOLDER", 2, "not that of a run"),
+        ("specimen read FOLDER/pipe.png", 2, "is no regular file"),
         ("run list --kind cutt", 2, "'kerf-coupon'"),
         ("run list --status dne", 2, "'interrupted'"),
         ("design check nowhere", 2, "double-bump"),

@@ -16,7 +16,7 @@ from drivers.rig.indenter import Indenter
 from drivers.rig.registers import RegisterMap
 from fabctl.bench import Bench
 from fabctl.config.bench import BenchConfig, RigConfig
-from fabctl.errors import RefusedError, Stopped
+from fabctl.errors import RefusedError, Stopped, UsageError
 from fabctl.events import Event
 from fabctl.indent import job
 from fabctl.indent.groups import analyse_groups
@@ -184,6 +184,13 @@ def test_a_coupon_is_not_pressed(lab: Lab) -> None:
     with pytest.raises(RefusedError, match="INDENT-COUPON"):
         refuse(lab.plan())
     assert lab.place.runs_of(lab.specimen.name) == []
+
+
+@pytest.mark.parametrize("text", ["null", "[]", '{"kind": "cou', ""])
+def test_a_damaged_manifest_of_the_design_is_told_by_its_path(lab: Lab, text: str) -> None:
+    (lab.specimen.design / "manifest.json").write_text(text)
+    with pytest.raises(UsageError, match=r"design/manifest\.json"):
+        lab.plan()
 
 
 def test_a_clearance_beyond_the_travel_is_refused_and_a_secant_that_no_load_reaches_is_told(lab: Lab) -> None:

@@ -7,6 +7,7 @@ import os
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fabctl.errors import RecordError
@@ -85,3 +86,21 @@ def test_a_last_line_that_was_cut_short_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "samples.csv"
     path.write_text(",".join(COLUMNS) + "\n" + row(1).text() + "\n" + row(2).text()[:20])
     assert len(read_samples(path).time_s) == 1
+
+
+@pytest.mark.parametrize("damage", ["short", "nul", "nan", "words"])
+def test_a_damaged_row_is_left_out_and_told_by_its_line(tmp_path: Path, damage: str) -> None:
+    cells = row(2).text().split(",")
+    bad = {
+        "short": ",".join(cells[:4]),
+        "nul": "\0" * 40,
+        "nan": ",".join(
+            "nan" if name.endswith(("_s", "_mm", "_N")) else c for name, c in zip(COLUMNS, cells, strict=True)
+        ),
+        "words": ",".join("x" if name == "curve" else c for name, c in zip(COLUMNS, cells, strict=True)),
+    }[damage]
+    path = tmp_path / "samples.csv"
+    path.write_text("\n".join([",".join(COLUMNS), row(1).text(), bad, row(3).text(), ""]))
+    found = read_samples(path)
+    assert (len(found.time_s), found.left_out) == (2, (3,))
+    assert np.isfinite(found.force_N).all()

@@ -9,6 +9,7 @@ import pytest
 
 from fabctl.errors import RefusedError, UsageError
 from fabctl.scan import cloud, stream
+from fabctl.scan.clean import clean
 from fabctl.scan.cloud import read_cloud, read_labelled
 from fabctl.scan.foreign import open3d
 
@@ -65,6 +66,12 @@ def test_what_is_no_cloud_is_refused_with_a_reason(
     (tmp_path / name).write_bytes(text)
     with pytest.raises(error):
         read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (1.0, 2.0, -0.7)])
+def test_points_on_one_straight_line_are_refused(way: tuple[float, float, float]) -> None:
+    with pytest.raises(RefusedError, match="SCAN-LINE"):
+        clean(np.linspace(0, 90, 900)[:, None] * way + 40.0)
 
 
 def test_points_that_are_no_numbers_are_left_out_and_counted(tmp_path: Path) -> None:
