@@ -48,7 +48,7 @@ def build(
     from fabctl.designing import build_folder
 
     home = lab().root
-    folder = output or home / "out" / load_spec(spec, home)[0].name
+    folder = output or home / "out" / load_spec(spec, home, target)[0].name
     design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress(), compensate, library)
     for finding in design.findings:
         say(str(finding))
