@@ -13,10 +13,11 @@ from design.cells.library import CellLibrary
 from design.cells.select import selection_curve
 from design.errors import DesignError
 from design.findings import Finding
-from design.flatten import FeasibilityReport, Limits, feasibility
+from design.flatten import FeasibilityReport, Flattening, Limits, feasibility
 from design.flatten.ladder import Remedy
 from design.pattern.paths import Layer, LayerPreset
 from design.pipeline import Design, build, cells_on_offer
+from design.preview import few_ticks
 from design.spec import DesignSpec
 from design.surface import TriMesh, boundary_loops
 from design.watch import Watch, unwatched
@@ -44,6 +45,12 @@ class Check:
             }
         found["findings"] = [finding.as_dict() for finding in self.findings]
         return found
+
+    def flattening(self) -> Flattening:
+        """Return the flat as the sheet would be built, else in the scale that suits the library best."""
+        if self.design is not None:
+            return self.design.flattening
+        return self.report.flattening().scaled(self.report.scale_ratio)
 
 
 def check(
@@ -94,7 +101,7 @@ def topology_of(mesh: TriMesh) -> str:
     )
 
 
-def misfit_png(mesh: TriMesh, report: FeasibilityReport, title: str) -> bytes:
+def misfit_png(mesh: TriMesh, found: Check, title: str) -> bytes:
     """Return a picture of where the surface fits the library: on the surface, and on its flat."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import PolyCollection
@@ -102,24 +109,30 @@ def misfit_png(mesh: TriMesh, report: FeasibilityReport, title: str) -> bytes:
 
     figure = Figure(figsize=(14, 6), layout="constrained")
     FigureCanvasAgg(figure)
-    flat = report.flattening()
-    expansion = flat.expansion_ratio / report.scale_ratio
+    report, flat = found.report, found.flattening()
+    expansion = flat.expansion_ratio
     colours = report.colors(mesh)[mesh.faces].mean(axis=1) / 255
     space = figure.add_subplot(1, 2, 1, projection="3d")
     x, y, z = mesh.vertices_mm.T
     surface = space.plot_trisurf(x, y, z, triangles=mesh.faces, linewidth=0)
     surface.set_facecolor(colours)
     space.set_aspect("equal")
+    few_ticks(space)
     space.set_title(f"{title}: grey fits, red asks for too much expansion, blue for too little", fontsize=9)
     plane = figure.add_subplot(1, 2, 2)
     faces = PolyCollection(list(flat.flat_mm[flat.faces]), array=expansion, cmap="viridis", linewidths=0)
     plane.add_collection(faces)
     plane.autoscale()
+    if found.design is not None:
+        width, height = found.design.drawing.size_mm
+        plane.set(xlim=(0, width), ylim=(0, height))
     plane.set(aspect="equal", xlabel="x, mm", ylabel="y, mm")
     low, high = report.limits.low_ratio, report.limits.high_ratio
-    spread = float(expansion.max() / expansion.min())
+    least, most = float(expansion.min()), float(expansion.max())
     plane.set_title(
-        f"the flat: spread {spread:.3f}, the library has {high / low:.3f} ({low:.3f} to {high:.3f})", fontsize=9
+        f"the flat's faces: spread {most / least:.3f} ({least:.3f} to {most:.3f}), "
+        f"the library has {high / low:.3f} ({low:.3f} to {high:.3f})",
+        fontsize=9,
     )
     figure.colorbar(faces, ax=plane, label="expansion, deployed over flat length", shrink=0.7)
     file = io.BytesIO()

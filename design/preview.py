@@ -53,18 +53,19 @@ def coupon_png(made: Coupon) -> bytes:
     axes = figure.add_subplot()
     _draw_sheet(figure, axes, made.drawing, corners, expansion, title)
     for patch in made.patches:
-        _draw_gauge(axes, patch)
+        draw_gauge(axes, patch)
     axes.set_xlabel("x, mm\nmeasure each patch from notch 1 to notch 2, flat and opened; write it into coupon.csv")
     return _png(figure)
 
 
-def _draw_gauge(axes: Any, patch: Patch) -> None:
-    """Draw the length to measure, from one notch to the one across, both named."""
+def draw_gauge(axes: Any, patch: Patch) -> None:
+    """Draw the length to measure, from one notch to the one across, both named inside the patch."""
     axes.plot(*patch.notches_mm.T, "o--", color="#b3261e", linewidth=1.2, markersize=5)
-    for number, ((x, y), side) in enumerate(zip(patch.notches_mm.tolist(), ("right", "left"), strict=True), start=1):
-        away = -4 if side == "right" else 4
+    for number, ((x, y), side) in enumerate(zip(patch.notches_mm.tolist(), ("left", "right"), strict=True), start=1):
+        away = 5 if side == "left" else -5  # towards the middle: outside, the next patch's name is near
         axes.annotate(f"{patch.label.split()[0]}{number}", (x, y), (away, 0), textcoords="offset points", ha=side,
-                      va="center", color="#b3261e", fontsize=9, weight="bold")  # fmt: skip
+                      va="center", color="#b3261e", fontsize=8, weight="bold",
+                      bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8})  # fmt: skip
 
 
 def _png(figure: Any) -> bytes:

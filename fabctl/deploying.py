@@ -71,7 +71,7 @@ def read_laid(folder: Path, home: Path) -> Laid:
     shape, _ = read_mesh(bundle.file("deployed.ply"))
     edge_mm = _edge_mm(centre)
     corners = _flat_corners(centre, inverted, edge_mm, shape)
-    config, _ = load_spec(str(bundle.file("spec.yaml")), home)
+    config, _ = load_spec(str(bundle.file("spec.yaml")), home, bundle.file("target.ply"))
     sheet = sheet_of(load_material(config.material, home), edge_mm)
     library = library_of(config, library_file(config, folder)).scaled(sheet)
     if config.cells == "expanding":

@@ -68,7 +68,7 @@ def read_inputs(
 
     Raises `ConfigError`, `UsageError`, `MeshError` or `RefusedError`, each with all that is wrong.
     """
-    config, path = load_spec(name, home)
+    config, path = load_spec(name, home, target)
     return _inputs_of(config, path.read_text(encoding="utf-8"), path.parent, home, target, cell_mm, library)
 
 
@@ -230,9 +230,7 @@ def target_file(config: SpecConfig, folder: Path, target: Path | None) -> Path:
 
 
 def made(asked: MadeTarget) -> TriMesh:
-    """Return one of the project's own surfaces; raise `UsageError` where there is none, or it has no such measure."""
-    if asked.make not in TARGETS:
-        raise UsageError(f"there is no target {asked.make!r} (known: {', '.join(sorted(TARGETS))})")
+    """Return one of the project's own surfaces; raise `UsageError` where it has no such measure."""
     try:
         return TARGETS[asked.make](**asked.arguments())
     except TypeError as fault:

@@ -48,7 +48,7 @@ def build(
     from fabctl.designing import build_folder
 
     home = lab().root
-    folder = output or home / "out" / load_spec(spec, home)[0].name
+    folder = output or home / "out" / load_spec(spec, home, target)[0].name
     design, bundle = build_folder(spec, folder, home, target, cell_mm, replace, progress(), compensate, library)
     for finding in design.findings:
         say(str(finding))
@@ -80,7 +80,11 @@ def build(
               help="Kind of cells, for a mesh or surface [expanding].")  # fmt: skip
 @click.option("--remedy", type=click.Choice(["none", "cones", "nearest", "both"]),
               help="What to try where no single sheet fits [the specification's, or none].")  # fmt: skip
-@click.option("--picture", type=PictureFile((".png",)), help="PNG of where the surface does not fit.")
+@click.option(
+    "--picture",
+    type=PictureFile((".png",)),
+    help="PNG of where the surface does not fit, and of its flat in the sheet's size.",
+)
 @json_option
 def check(
     target: str,
@@ -108,7 +112,7 @@ def check(
     inputs = inputs_for(target, material, lab().root, cell_mm, cast(Any, cells), library)
     found = checked(inputs.spec, inputs.mesh, inputs.library, inputs.presets, cast(Any, remedy), progress_of(listen))
     if picture is not None:
-        write_atomically(picture, misfit_png(inputs.mesh, found.report, inputs.spec.name))
+        write_atomically(picture, misfit_png(inputs.mesh, found, inputs.spec.name))
     findings = [*inputs.findings, *found.findings]
     for finding in findings:
         say(str(finding))
@@ -131,6 +135,7 @@ def check(
         )
     fits = found.design is not None
     lines.append("it fits" if fits else "it does not fit")
+    lines += [f"picture {picture}"] if picture is not None else []
     if found.report.best() is None and (remedy or inputs.spec.remedy()) == "none":
         lines.append("--remedy both tries cones, and the nearest surface that fits")
     facts = {"target": target, "fits": fits, **found.as_dict()}

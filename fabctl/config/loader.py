@@ -34,15 +34,18 @@ class Model(BaseModel):
 M = TypeVar("M", bound=BaseModel)
 
 
-def load(path: Path, model: type[M]) -> M:
-    """Return the file at `path` as `model`; raise `ConfigError` with all complaints, each `file:line: key: what`."""
+def load(path: Path, model: type[M], context: Any = None) -> M:
+    """Return the file at `path` as `model`; raise `ConfigError` with all complaints, each `file:line: key: what`.
+
+    `context` is what the model's validators may look at beside the file.
+    """
     try:
-        return parse(text_of(path, "a YAML file"), model, str(path))
+        return parse(text_of(path, "a YAML file"), model, str(path), context)
     except UsageError as fault:
         raise ConfigError([str(fault)]) from fault
 
 
-def parse(text: str, model: type[M], name: str) -> M:
+def parse(text: str, model: type[M], name: str, context: Any = None) -> M:
     """Return YAML `text` as `model`; `name` stands in the complaints."""
     marks: Marks = {}
     complaints: list[str] = []
@@ -59,7 +62,7 @@ def parse(text: str, model: type[M], name: str) -> M:
         kind = "a list" if isinstance(data, tuple) else "one value"
         raise ConfigError([f"{name}:1: a mapping of keys was expected, not {kind}"])
     try:
-        checked = model.model_validate(data)
+        checked = model.model_validate(data, context=context)
     except ValidationError as fault:
         complaints += _complaints(fault.errors(), data, marks, name)
     if complaints:
@@ -118,7 +121,7 @@ def _keys(error: Any, data: Any) -> tuple[str | int, ...]:
 def _complaint(path: tuple[str | int, ...], error: Any, marks: Marks, name: str) -> str:
     line = next((marks[path[:k]] for k in range(len(path), -1, -1) if path[:k] in marks), 1)
     told = {"extra_forbidden": "unknown key", "model_type": "a mapping of keys was expected"}
-    text = told.get(error["type"], str(error["msg"]))
+    text = told.get(error["type"], str(error["msg"]).removeprefix("Value error, "))
     if error["type"] not in ("missing", "extra_forbidden") and not isinstance(error["input"], dict | tuple):
         text += f", not {error['input']!r}"
     return f"{name}:{line}: {_dotted(path)}: {text}" if path else f"{name}:{line}: {text}"

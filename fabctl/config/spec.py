@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from design.cells.select import Rule, SelectionOptions
 from design.flatten import FlattenOptions
@@ -17,7 +18,8 @@ from design.pattern.slits import HingeOptions, HingeRule
 from design.pattern.tiling import Placement
 from design.pattern.toolpath import Sides, ToolOptions
 from design.spec import DesignSpec, Infeasible, Kind, Region, ResponseOptions, Rim
-from fabctl.config.bench import Positive, find
+from design.targets import TARGETS
+from fabctl.config.bench import Positive, find, names
 from fabctl.config.loader import Model, load
 
 Length = Annotated[float, Field(ge=0)]
@@ -35,6 +37,13 @@ class MadeTarget(Model):
     height_mm: Positive | None = None
     half_angle_deg: Positive | None = None
     edge_mm: Positive | None = None
+
+    @field_validator("make")
+    @classmethod
+    def _known(cls, make: str) -> str:
+        if make not in TARGETS:
+            raise ValueError(f"there is no such target (known: {', '.join(sorted(TARGETS))})")
+        return make
 
     def arguments(self) -> dict[str, float]:
         """Return the measures that were given, angles in radians."""
@@ -142,6 +151,17 @@ class ResponseConfig(Model):
     point_mm: tuple[float, float, float] | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """Where the names in a specification are looked for: the lab, and the specification's own folder.
+
+    `beside` is None where another target than the file's is taken.
+    """
+
+    home: Path
+    beside: Path | None
+
+
 class SpecConfig(Model):
     """One design, asked for. `target` is a mesh file (relative to this file), or one of the project's own surfaces."""
 
@@ -165,6 +185,23 @@ class SpecConfig(Model):
     bed_mm: tuple[Positive, Positive] | None = None
     compensate: bool | Rim = False
     response: ResponseConfig | None = ResponseConfig()
+
+    @field_validator("material")
+    @classmethod
+    def _material_known(cls, name: str, info: ValidationInfo) -> str:
+        if isinstance(info.context, Surroundings):
+            home, is_file = info.context.home, Path(name).is_file()
+            if not is_file and name not in (known := names("materials", home)):
+                raise ValueError(f"there is no such material (known: {', '.join(known)})")
+        return name
+
+    @field_validator("target")
+    @classmethod
+    def _target_there(cls, target: str | MadeTarget, info: ValidationInfo) -> str | MadeTarget:
+        beside = info.context.beside if isinstance(info.context, Surroundings) else None
+        if beside is None or not isinstance(target, str) or (beside / target).exists() or Path(target).exists():
+            return target
+        raise ValueError("there is no such file, neither beside the specification nor from here")
 
     @model_validator(mode="after")
     def _contracting_cells_as_simulated(self) -> SpecConfig:
@@ -209,7 +246,10 @@ class SpecConfig(Model):
         )
 
 
-def load_spec(name: str, home: Path) -> tuple[SpecConfig, Path]:
-    """Return the specification called `name` (a path, or a name in `configs/specs`) and the file it came from."""
+def load_spec(name: str, home: Path, target: Path | None = None) -> tuple[SpecConfig, Path]:
+    """Return the specification called `name` (a path, or a name in `configs/specs`) and the file it came from.
+
+    The names in it are looked up with all else that is checked; that of its target unless `target` takes its place.
+    """
     path = find("specs", name, home)
-    return load(path, SpecConfig), path
+    return load(path, SpecConfig, Surroundings(home, path.parent if target is None else None)), path

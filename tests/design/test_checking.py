@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from design.cells.library import load_library
@@ -21,6 +22,9 @@ def test_a_surface_that_fits_is_laid_out_and_timed() -> None:
     assert found.design is not None
     assert found.design.predicted is None
     assert found.as_dict()["cut_time_s"] > 30
+    drawn, cells = found.flattening(), found.design.cells
+    assert np.ptp(drawn.flat_mm, axis=0) == pytest.approx(np.ptp(cells.tiling.vertices_mm, axis=0), rel=0.25)
+    assert drawn.expansion_ratio.mean() == pytest.approx(cells.wanted_ratio.mean(), rel=0.02)
     assert not [finding for finding in found.findings if finding.level == "error"]
 
 
@@ -30,7 +34,7 @@ def test_a_surface_that_no_sheet_can_become_is_proven_so_and_pictured() -> None:
     assert found.design is None
     assert found.report.proven_infeasible
     assert {"FIT-PROVEN", "FIT-WHERE"} <= {finding.code for finding in found.findings}
-    assert misfit_png(mesh, found.report, "spike").startswith(b"\x89PNG")
+    assert misfit_png(mesh, found, "spike").startswith(b"\x89PNG")
 
 
 def test_the_remedy_is_the_specifications_own_and_the_ladder_is_climbed_once(monkeypatch: pytest.MonkeyPatch) -> None:

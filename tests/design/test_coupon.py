@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import shapely
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from design.bundle import Bundle, open_bundle, write_coupon_bundle
 from design.cells.library import load_library
@@ -22,7 +24,7 @@ from design.job import compose_job
 from design.pattern.drawing import as_json, from_json
 from design.pattern.paths import LAYERS, LayerPreset
 from design.pattern.toolpath import ToolOptions, strokes_of
-from design.preview import coupon_png
+from design.preview import coupon_png, draw_gauge
 
 PRESETS = {layer: LayerPreset(0.5, 20.0) for layer in LAYERS}
 COLUMNS, ROWS = 3, 2
@@ -74,6 +76,17 @@ def test_the_picture_names_both_notches_of_every_patch(made: Coupon, monkeypatch
     assert list(named) == ["A1", "A2", "B1", "B2"]
     for patch in made.patches:
         assert [named[f"{patch.label[0]}{k}"] for k in (1, 2)] == pytest.approx(patch.notches_mm)
+
+
+def test_the_names_of_notches_lie_inside_their_patch(made: Coupon) -> None:
+    axes = Figure(figsize=(7.5, 4)).add_subplot()
+    axes.set(xlim=(0, made.drawing.size_mm[0]), ylim=(0, made.drawing.size_mm[1]), aspect="equal")
+    for patch in made.patches:
+        draw_gauge(axes, patch)
+    FigureCanvasAgg(axes.figure).draw()
+    for patch, names in zip(made.patches, (axes.texts[:2], axes.texts[2:]), strict=True):
+        low, high = axes.transData.transform(patch.notches_mm)[:, 0]
+        assert all(low < box.x0 and box.x1 < high for box in (name.get_window_extent() for name in names))
 
 
 def test_every_patch_carries_its_letter_and_the_id_on_a_tag_of_its_own(made: Coupon) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from design.bundle import open_bundle
-from design.errors import BundleError, UnreadableMesh
+from design.errors import BundleError
 from fabctl.designing import build_folder, inputs_for, read_inputs
 from fabctl.errors import ConfigError, RefusedError, UsageError
 from fabctl.events import Event
@@ -51,13 +51,22 @@ def test_a_specification_with_faults_is_refused_with_all_of_them_and_their_lines
         assert line in str(fault.value)
 
 
+@pytest.mark.parametrize("target", ["{make: kap}", "nowhere.obj"])
+def test_names_that_mean_nothing_are_told_with_the_other_faults_of_the_file(target: str, tmp_path: Path) -> None:
+    (tmp_path / "spec.yaml").write_text(f"name: x\ntarget: {target}\nmaterial: rubber\ncell_mm: -1\n")
+    with pytest.raises(ConfigError) as fault:
+        read_inputs(str(tmp_path / "spec.yaml"), tmp_path)
+    lines = fault.value.complaints
+    assert all(part in line for part, line in zip((":2: target", ":3: material", ":4: cell_mm"), lines, strict=True))
+
+
 @pytest.mark.parametrize(
     ("text", "kind", "says"),
     [
-        ("name: x\ntarget: {make: spoon}\n", UsageError, "spoon"),
+        ("name: x\ntarget: {make: spoon}\n", ConfigError, "spoon"),
         ("name: x\ntarget: {make: saddle, half_angle_deg: 20}\n", UsageError, "no such measure"),
         ("name: x\ntarget: {make: cap}\nmaterial: neoprene-2.0\n", RefusedError, "hydrogen chloride"),
-        ("name: x\ntarget: nowhere.obj\n", UnreadableMesh, "nowhere.obj"),
+        ("name: x\ntarget: nowhere.obj\n", ConfigError, r"spec.yaml:2: target.*nowhere.obj"),
         ("name: x\ntarget: {make: cap}\nscale: {end: value}\n", ConfigError, "high_ratio"),
     ],
 )
