@@ -27,7 +27,9 @@ class WireLog:
             if self._stream.write(data) != len(data):
                 raise OSError(28, "the disk took only part of the row")
         except OSError as fault:
-            raise RecordError(f"{self._path}: {fault.strerror or fault}; the run was stopped, make room first") from fault
+            raise RecordError(
+                f"{self._path}: {fault.strerror or fault}; the run was stopped, make room first"
+            ) from fault
 
     def mark(self, remark: str, t_s: float) -> None:
         """Keep a remark among the bytes, such as where the program begins."""
