@@ -58,17 +58,19 @@ def show_run(run: str, as_json: bool) -> None:
     found = lab().run(run)
     manifest, result = found.manifest(), found.result() or {}
     files = sorted(str(p.relative_to(found.path)) for p in found.path.rglob("*") if p.is_file())
-    state = status_of(found)
+    state, outcome = status_of(found), found.outcome()
+    message = str((outcome or {}).get("message") or "")
     lines = [
         f"{found.run_id}: {manifest['kind']}, {state}",
         f"specimen  {manifest.get('specimen') or '-'}",
         f"started   {manifest['started_utc']} by {manifest['operator']}",
+        *(f"ended     {line.strip()}" for line in message.splitlines()),
         *(f"input     {item['path']}  {item['sha256'][:12]}" for item in manifest["inputs"]),
         *(f"result    {line}" for line in figures(result)),
         *(f"file      {name}" for name in files),
     ]
     data = {"run": found.run_id, "path": str(found.path), "status": state, "manifest": manifest, "result": result}
-    show({**data, "outcome": found.outcome(), "files": files}, as_json, lines)
+    show({**data, "outcome": outcome, "files": files}, as_json, lines)
 
 
 @command.command("export")

@@ -37,19 +37,26 @@ def indent_step(run: RunFolder, design: Path) -> Step:
     predicted = design / "response.csv"
     curves = run.path / "artefacts" / "curves.csv"
     figures = (plot(curves, predicted if predicted.is_file() else None),) if curves.is_file() else ()
-    summary = (
-        f"Method {method}, {result.get('curves_count', 0)} curves that count, {result.get('rows_count', 0)} samples."
-    )
     outcome = run.outcome() or {}
     notes = tuple(f"{f['level']}: {f['message']}" for f in result.get("findings", []))
     if outcome.get("status") != "done" and outcome.get("message"):
         notes = (str(outcome["message"]), *notes)
     if outcome.get("status") == "done" and "curves" not in result:
         notes = (f"recorded, its figures are not computed: fabctl indent analyse {run.run_id}", *notes)
+    summary = f"Method {method}, {_counted(run, result)}."
     return Step(
         "Indentation", status_of(run), summary, tuple(_facts(result, config, _started(manifest))), figures, notes,
         bool(is_simulated(manifest)),
     )  # fmt: skip
+
+
+def _counted(run: RunFolder, result: Mapping[str, Any]) -> str:
+    """Return how much was measured; of a run that was broken off, what its files hold."""
+    if "curves_count" in result:
+        return f"{result['curves_count']} curves that count, {result.get('rows_count', 0)} samples"
+    samples = run.path / "samples.csv"
+    count = max(0, samples.read_bytes().count(b"\n") - 1) if samples.is_file() else 0
+    return f"{count} samples recorded, no figures computed"
 
 
 def _facts(result: Mapping[str, Any], config: Mapping[str, Any], started: datetime | None) -> list[Fact]:

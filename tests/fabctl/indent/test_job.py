@@ -9,18 +9,22 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from benchmarks._rig_memory import REGISTERS, MemoryBus
 from design.findings import Finding
 from drivers.rig.indenter import Indenter
 from drivers.rig.registers import RegisterMap
 from fabctl.bench import Bench
+from fabctl.cli.main import cli
 from fabctl.config.bench import BenchConfig, RigConfig
 from fabctl.errors import RefusedError, Stopped, UsageError
 from fabctl.events import Event
 from fabctl.indent import job
+from fabctl.indent.analysis import read_samples
 from fabctl.indent.groups import analyse_groups
 from fabctl.indent.job import IndentPlan, Steering, plan_test, refuse, run_test
+from fabctl.indent.run import NoContact
 from fabctl.indent.sampling import Wish
 from fabctl.records.ending import undisturbed
 from fabctl.records.folder import RunFolder, start_run, status_of
@@ -214,3 +218,17 @@ def test_a_resume_of_a_resumed_test_repeats_no_curve_and_no_test_is_gone_on_with
     (found,) = [f for f in lab.plan(resume=first).findings if f.level == "error"]
     assert (found.code, second.run_id in found.message) == ("RESUME-TWICE", True)
     assert found.hint == f"go on with that one: --resume {second.run_id}"
+
+
+def test_a_test_that_met_nothing_says_what_it_recorded_and_why_it_failed(lab: Lab) -> None:
+    lab.device.specimen = None
+    with pytest.raises(NoContact):
+        lab.test(lab.plan())
+    run = lab.newest()
+    assert status_of(run) == "failed"
+    step = indent_step(run, lab.specimen.design)
+    count = len(read_samples(run.path / "samples.csv").time_s)
+    assert count > 10
+    assert f"{count} samples recorded" in step.summary
+    shown = CliRunner().invoke(cli, ["--home", str(lab.place.root), "run", "show", run.run_id])
+    assert "the force did not rise" in shown.output
