@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -47,33 +47,34 @@ class Check:
         return asdict(self)
 
 
-def machine_checks(lab: Workspace) -> list[Check]:
-    """Return what speaks for and against this machine."""
+def machine_checks(lab: Workspace) -> Iterator[Check]:
+    """Yield what speaks for and against this machine, each as soon as it is known."""
     good = (3, 11) <= sys.version_info[:2] <= (3, 13)
-    found = [Check("python", good, platform.python_version(), "" if good else "3.11, 3.12 or 3.13 is needed")]
-    found += [_import(name, module) for name, module in IMPORTS]
-    found += [_folder(lab), _library()]
-    return found
+    yield Check("python", good, platform.python_version(), "" if good else "3.11, 3.12 or 3.13 is needed")
+    for name, module in IMPORTS:
+        yield _import(name, module)
+    yield _folder(lab)
+    yield _library()
 
 
-def bench_checks(lab: Workspace, name: str) -> list[Check]:
-    """Return what the devices of a bench say of themselves; nothing is moved and no setting is written."""
+def bench_checks(lab: Workspace, name: str) -> Iterator[Check]:
+    """Yield what the devices of a bench say of themselves; nothing is moved and no setting is written."""
     config = load_bench(name, lab.root)
     try:
         with open_bench(lab, config, "doctor") as bench:
-            found = [Check("bench", True, f"{config.name}, free")]
+            yield Check("bench", True, f"{config.name}, free")
             if config.laser is not None:
-                found.append(_device("laser", lambda: _ask_laser(bench.url("laser"))))
+                yield _device("laser", lambda: _ask_laser(bench.url("laser")))
             if config.rig is not None:
                 rig_map = config.rig.map
-                found.append(_device("rig", lambda: _ask_rig(bench.url("rig"), rig_map, lab)))
+                yield _device("rig", lambda: _ask_rig(bench.url("rig"), rig_map, lab))
             if config.camera is not None:
-                found.append(_device("camera", lambda: _ask_camera(bench.url("camera"))))
+                yield _device("camera", lambda: _ask_camera(bench.url("camera")))
     except FabctlError as fault:
-        return [Check("bench", False, str(fault))]
+        yield Check("bench", False, str(fault))
+        return
     if config.scan is not None:
-        found.append(_scan_source(config, lab))
-    return found
+        yield _scan_source(config, lab)
 
 
 def _import(name: str, module: str) -> Check:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import chain
+from typing import TYPE_CHECKING
+
 import click
 
 from fabctl.cli.common import json_option, lab, show
 from fabctl.cli.paths import config_names
 from fabctl.errors import DEVICE, DONE
+
+if TYPE_CHECKING:
+    from fabctl.health import Check
 
 
 @click.command("doctor")
@@ -23,12 +29,17 @@ def command(bench_name: str | None, as_json: bool) -> None:
     from fabctl.health import bench_checks, machine_checks
 
     home = lab()
-    checks = machine_checks(home)
-    if bench_name is not None:
-        checks += bench_checks(home, bench_name)
-    mark = {True: "ok  ", False: "FAIL"}
-    lines = [f"{mark[c.works]} {c.what:28} {c.detail}" + (f"\n       {c.hint}" if c.hint else "") for c in checks]
+    checks = []
+    for check in chain(machine_checks(home), bench_checks(home, bench_name) if bench_name is not None else ()):
+        checks.append(check)
+        if not as_json:
+            click.echo(_line(check))  # at once: a library that loads slowly, or a silent device, takes seconds
     good = all(c.works for c in checks)
     bad = [Finding("DOCTOR", c.detail, where=c.what, hint=c.hint) for c in checks if not c.works]
     data = {"works": good, "checks": [c.as_dict() for c in checks], "findings": [f.as_dict() for f in bad]}
-    show(data, as_json, lines, DONE if good else DEVICE, f"{len(bad)} of {len(checks)} do not work")
+    show(data, as_json, (), DONE if good else DEVICE, f"{len(bad)} of {len(checks)} do not work")
+
+
+def _line(check: Check) -> str:
+    mark = "ok  " if check.works else "FAIL"
+    return f"{mark} {check.what:28} {check.detail}" + (f"\n       {check.hint}" if check.hint else "")

@@ -61,7 +61,9 @@ def energy(curve: Curve, states_ratio: tuple[float, float], scale_mJ: float, tit
         axes.plot(curve.F00_ratio, values)
         axes.plot(curve.F00_ratio[marks], values[marks], "o", color="#b5482f", markersize=4)
         for mark, name in zip(marks, ("saddle", "second state"), strict=True):
-            axes.annotate(name, (curve.F00_ratio[mark], values[mark]), (4, 4), textcoords="offset points", fontsize=8)
+            away, side = (4, "left") if name == "saddle" else (-4, "right")  # the second state lies near the frame
+            place = (curve.F00_ratio[mark], values[mark])
+            axes.annotate(name, place, (away, 4), textcoords="offset points", ha=side, fontsize=8)
     left.set(title=title, xlabel="1 + ε", ylabel="E*, mJ per cell")
     right.axhline(0, color="0.6", linewidth=0.8)
     right.set(xlabel="1 + ε", ylabel="dE*/dε, mJ per cell")
