@@ -18,7 +18,7 @@ from drivers.rig.registers import RegisterMap
 from fabctl.bench import Bench
 from fabctl.cli.main import cli
 from fabctl.config.bench import BenchConfig, RigConfig
-from fabctl.errors import RefusedError, Stopped, UsageError
+from fabctl.errors import REFUSED, RefusedError, Stopped, UsageError
 from fabctl.events import Event
 from fabctl.indent import job
 from fabctl.indent.analysis import read_samples
@@ -222,10 +222,12 @@ def test_a_resume_of_a_resumed_test_repeats_no_curve_and_no_test_is_gone_on_with
 
 def test_a_test_that_met_nothing_says_what_it_recorded_and_why_it_failed(lab: Lab) -> None:
     lab.device.specimen = None
-    with pytest.raises(NoContact):
+    with pytest.raises(NoContact) as caught:
         lab.test(lab.plan())
     run = lab.newest()
-    assert status_of(run) == "failed"
+    assert (status_of(run), caught.value.exit_code) == ("failed", REFUSED)
+    assert f"`fabctl rig retract`; go on by --resume {run.run_id}" in caught.value.__notes__[0]
+    assert "the indenter stands at 40.00 mm" in (run.path / "events.jsonl").read_text()
     step = indent_step(run, lab.specimen.design)
     count = len(read_samples(run.path / "samples.csv").time_s)
     assert count > 10
