@@ -33,7 +33,7 @@ from fabctl.workspace import Specimen, Workspace
 from simulators.rig.controller import Controller, Machine
 from simulators.specimens import curve
 from simulators.specimens.analytic import linear
-from tests.rig_endpoints import short_method
+from tests.rig_endpoints import rig_bench, short_method
 
 METHOD = short_method(
     "step: approach, speed_mm_s: 4, trigger_N: 0.02, clearance_mm: 0.8",
@@ -234,3 +234,16 @@ def test_a_test_that_met_nothing_says_what_it_recorded_and_why_it_failed(lab: La
     assert f"{count} samples recorded" in step.summary
     shown = CliRunner().invoke(cli, ["--home", str(lab.place.root), "run", "show", run.run_id])
     assert "the force did not rise" in shown.output
+
+
+def test_a_dry_run_is_refused_by_how_the_rig_was_left_as_the_test_would_be(lab: Lab) -> None:
+    bench = lab.place.root / "here.yaml"
+    bench.write_text(rig_bench("memory:", "here"))
+    lab.plan()
+    words = ["--home", str(lab.place.root), "indent", "run", lab.specimen.name, "--dry-run", "--bench", str(bench)]
+    words += ["--method", str(lab.place.root / "short.yaml")]
+    assert CliRunner().invoke(cli, words).exit_code == 0
+    lab.test(lab.plan())
+    lab.device.axis.position_mm = 30.0
+    done = CliRunner().invoke(cli, words, standalone_mode=False)
+    assert "RIG-DOWN" in str(done.exception)
