@@ -74,11 +74,12 @@ def run_command(
     as_json: bool,
 ) -> None:
     """Press a SPECIMEN by a method and record its force."""
+    from drivers.errors import DeviceError
     from fabctl.bench import open_bench
     from fabctl.cli.steering import Keys
     from fabctl.config.bench import load_bench
-    from fabctl.errors import Stopped
-    from fabctl.indent.job import Steering, plan_test, refuse, run_test
+    from fabctl.errors import BenchBusy, Stopped, UsageError
+    from fabctl.indent.job import Steering, ask_rig, plan_test, refuse, run_test
 
     place = lab()
     bench_config = load_bench(bench_name, place.root)
@@ -95,6 +96,11 @@ def run_command(
         say(line)
     refuse(plan)
     if dry_run:
+        try:
+            with open_bench(place, bench_config, f"asking the rig for {specimen}") as bench:
+                ask_rig(plan, bench)
+        except (BenchBusy, DeviceError, UsageError) as fault:
+            say(f"  the rig could not be asked: {fault}")
         show(_planned(plan), as_json, ["dry run: nothing was moved"])
         return
     if not confirm("Start?", yes):

@@ -25,7 +25,7 @@ from fabctl.indent.calibration import Calibration, load_calibration
 from fabctl.indent.method import Action, Predicted, actions, check, read_predicted, time_s
 from fabctl.indent.recorder import Recorder
 from fabctl.indent.resume import against_resuming, curves_done, on_another_rig, points_without_contact, resumed
-from fabctl.indent.run import Ending, Runner
+from fabctl.indent.run import Ending, NoContact, Runner, left_behind
 from fabctl.indent.sampling import Wish
 from fabctl.priority import before_other_work
 from fabctl.records.ending import outcome_kept
@@ -156,7 +156,11 @@ def run_test(
         run = start_run(lab.runs, "indent", specimen=plan.specimen.name, inputs=inputs, config=config)
         with outcome_kept(run):
             emit(Event("stage", f"run {run.run_id}"))
-            ending = _record(run, plan, rig, emit, steering or Steering(), clock or WallClock())
+            try:
+                ending = _record(run, plan, rig, emit, steering or Steering(), clock or WallClock())
+            except (Stopped, NoContact) as fault:
+                fault.add_note(f"look at the specimen, then `fabctl rig retract`; go on by --resume {run.run_id}")
+                raise
             run.write_result(_sampled(plan, ending))
             run.finish("done")  # the samples are whole: what breaks off the figures takes nothing from them
     emit(Event("stage", "recorded; computing the figures"))
@@ -267,6 +271,15 @@ def _uncalibrated(bench: str) -> list[Finding]:
             hint="fabctl rig calibrate force, then fabctl rig calibrate frame",
         )
     ]
+
+
+def ask_rig(plan: IndentPlan, bench: Bench) -> None:
+    """Raise `RefusedError` where the rig that answers, or how it was left, stands against the plan; nothing moves."""
+    with contextlib.closing(open_indenter(bench.url("rig"), plan.registers)) as rig:
+        _refuse_rig(plan, rig.identify())
+        left = left_behind(rig.fresh_sample(), plan.method.safe_height_mm)
+    if left:
+        raise RefusedError("the rig is not ready for a test", left)
 
 
 def _refuse_rig(plan: IndentPlan, identity: Identity) -> None:

@@ -6,6 +6,7 @@ stays where it is, so that nothing is pressed or torn by a retraction nobody ask
 
 from __future__ import annotations
 
+import contextlib
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -158,7 +159,14 @@ class Runner:
             self.emit(Event("warning", f"rig: {fault}"))
         if not stopped:
             self.emit(Event("warning", "rig: the stop was not confirmed; the controller's watchdog stops the stage"))
+        else:
+            self._tell_what_is_left()
         self.ending.lost_count, self.ending.rows_count = self.rig.lost_count, self.sampler.rows_count
+
+    def _tell_what_is_left(self) -> None:
+        with contextlib.suppress(DeviceError):
+            for each in left_behind(self.rig.fresh_sample(), self.method.safe_height_mm):
+                self.emit(Event("warning", f"{each.message}; {each.hint}"))
 
     # --- one action
 

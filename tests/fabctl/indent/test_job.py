@@ -18,7 +18,7 @@ from drivers.rig.registers import RegisterMap
 from fabctl.bench import Bench
 from fabctl.cli.main import cli
 from fabctl.config.bench import BenchConfig, RigConfig
-from fabctl.errors import RefusedError, Stopped, UsageError
+from fabctl.errors import REFUSED, RefusedError, Stopped, UsageError
 from fabctl.events import Event
 from fabctl.indent import job
 from fabctl.indent.analysis import read_samples
@@ -33,7 +33,7 @@ from fabctl.workspace import Specimen, Workspace
 from simulators.rig.controller import Controller, Machine
 from simulators.specimens import curve
 from simulators.specimens.analytic import linear
-from tests.rig_endpoints import short_method
+from tests.rig_endpoints import rig_bench, short_method
 
 METHOD = short_method(
     "step: approach, speed_mm_s: 4, trigger_N: 0.02, clearance_mm: 0.8",
@@ -222,13 +222,28 @@ def test_a_resume_of_a_resumed_test_repeats_no_curve_and_no_test_is_gone_on_with
 
 def test_a_test_that_met_nothing_says_what_it_recorded_and_why_it_failed(lab: Lab) -> None:
     lab.device.specimen = None
-    with pytest.raises(NoContact):
+    with pytest.raises(NoContact) as caught:
         lab.test(lab.plan())
     run = lab.newest()
-    assert status_of(run) == "failed"
+    assert (status_of(run), caught.value.exit_code) == ("failed", REFUSED)
+    assert f"`fabctl rig retract`; go on by --resume {run.run_id}" in caught.value.__notes__[0]
+    assert "the indenter stands at 40.00 mm" in (run.path / "events.jsonl").read_text()
     step = indent_step(run, lab.specimen.design)
     count = len(read_samples(run.path / "samples.csv").time_s)
     assert count > 10
     assert f"{count} samples recorded" in step.summary
     shown = CliRunner().invoke(cli, ["--home", str(lab.place.root), "run", "show", run.run_id])
     assert "the force did not rise" in shown.output
+
+
+def test_a_dry_run_is_refused_by_how_the_rig_was_left_as_the_test_would_be(lab: Lab) -> None:
+    bench = lab.place.root / "here.yaml"
+    bench.write_text(rig_bench("memory:", "here"))
+    lab.plan()
+    words = ["--home", str(lab.place.root), "indent", "run", lab.specimen.name, "--dry-run", "--bench", str(bench)]
+    words += ["--method", str(lab.place.root / "short.yaml")]
+    assert CliRunner().invoke(cli, words).exit_code == 0
+    lab.test(lab.plan())
+    lab.device.axis.position_mm = 30.0
+    done = CliRunner().invoke(cli, words, standalone_mode=False)
+    assert "RIG-DOWN" in str(done.exception)
