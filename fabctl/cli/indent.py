@@ -20,11 +20,11 @@ NAMED = (
     ("secant stiffness", "stiffness_secant_N_mm", "N/mm"),
     ("largest force", "force_max_N", "N"),
     ("energy in", "load_energy_mJ", "mJ"),
-    ("hysteresis", "hysteresis_ratio", ""),
+    ("hysteresis", "hysteresis_ratio", "%"),
     ("barrier", "barrier_mJ", "mJ"),
-    ("recovery", "recovery_ratio", ""),
+    ("recovery", "recovery_ratio", "%"),
 )
-HELD = (("relaxation", "relaxation_ratio", ""), ("creep", "creep_mm", "mm"))  # told only where a method holds
+HELD = (("relaxation", "relaxation_ratio", "%"), ("creep", "creep_mm", "mm"))  # told only where a method holds
 WORDS = {name: words for words, name, _ in NAMED}
 
 
@@ -209,4 +209,4 @@ def _lines(result: dict[str, Any]) -> Iterator[str]:
         if value is None:
             yield f"  {words:22} not found: {result.get('not_found', {}).get(name, 'no curve')}"
         else:
-            yield f"  {words:22} {value:.4g} {unit}"
+            yield f"  {words:22} {100 * value if unit == '%' else value:.4g} {unit}"
