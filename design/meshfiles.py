@@ -99,7 +99,7 @@ def _or_raise(path: Path, found: list[Finding]) -> list[Finding]:
     if not wrong:
         return found
     kind = UnreadableMesh if any(fault.code in _UNREADABLE for fault in wrong) else MeshError
-    raise kind(f"{path} cannot be used as a target: {len(wrong)} fault(s)", found)
+    raise kind(f"{path} cannot be used as a target: {len(wrong)} fault{'s' * (len(wrong) > 1)}", found)
 
 
 def _triangles(soup: Soup, found: list[Finding]) -> Faces:

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 FORMAT = 1
 SHIPPED = Path(__file__).parent / "data" / "library.npz"
 SHIPPED_OPEN = SHIPPED.with_name("library-open.npz")
-VERDICTS = ("bistable", "not bistable", "invalid", "not converged")
+VERDICTS = ("bistable", "not bistable", "invalid", "not converged", "not in the map")  # the last: never solved
 NUMBERS = (
     "expansion_ratio",
     "saddle_ratio",

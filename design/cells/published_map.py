@@ -76,7 +76,7 @@ def _table(path: Path, rows: Published, sheet: Sheet) -> dict[str, Array]:
     return {
         "t_mm": grid_t,
         "theta_rad": grid_theta,
-        "verdict": np.where(known, VERDICTS.index("bistable"), VERDICTS.index("not converged")).astype(float),
+        "verdict": np.where(known, VERDICTS.index("bistable"), VERDICTS.index(REASONS[1])).astype(float),
         "reason": np.where(known, 0.0, 1.0),
         "residual_ratio": unknown,
         "expansion_ratio": spread(rows.expansion_ratio),

@@ -20,11 +20,11 @@ NAMED = (
     ("secant stiffness", "stiffness_secant_N_mm", "N/mm"),
     ("largest force", "force_max_N", "N"),
     ("energy in", "load_energy_mJ", "mJ"),
-    ("hysteresis", "hysteresis_ratio", ""),
+    ("hysteresis", "hysteresis_ratio", "%"),
     ("barrier", "barrier_mJ", "mJ"),
-    ("recovery", "recovery_ratio", ""),
+    ("recovery", "recovery_ratio", "%"),
 )
-HELD = (("relaxation", "relaxation_ratio", ""), ("creep", "creep_mm", "mm"))  # told only where a method holds
+HELD = (("relaxation", "relaxation_ratio", "%"), ("creep", "creep_mm", "mm"))  # told only where a method holds
 LINES_TOLD_COUNT = 5
 WORDS = {name: words for words, name, _ in NAMED}
 
@@ -216,7 +216,7 @@ def _lines(result: dict[str, Any]) -> Iterator[str]:
         if value is None:
             yield f"  {words:22} not found: {result.get('not_found', {}).get(name, 'no curve')}"
         else:
-            yield f"  {words:22} {value:.4g} {unit}"
+            yield f"  {words:22} {100 * value if unit == '%' else value:.4g} {unit}"
     if bad := result.get("lines_left_out"):
         which = ", ".join(map(str, bad[:LINES_TOLD_COUNT])) + (", …" if len(bad) > LINES_TOLD_COUNT else "")
         yield f"  {'left out':22} {len(bad)} damaged row{'s' * (len(bad) > 1)} of samples.csv, line {which}"

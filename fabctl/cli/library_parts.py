@@ -91,7 +91,7 @@ def lines_of(library: CellLibrary) -> Iterator[str]:
             f"{shallow} of them were decided at half the mesh size: at the full size their barrier is less than "
             f"{SHALLOW_WELL_RATIO:.1%} of the energy stored"
         )
-    yield "candidates: " + ", ".join(f"{count} {verdict}" for verdict, count in library.counts().items())
+    yield "candidates: " + ", ".join(f"{count} {verdict}" for verdict, count in library.counts().items() if count)
     yield from (f"  {count:5d} {reason}" for reason, count in library.reasons().items())
     yield (
         f"sheet: edge {sheet.edge_mm:g} mm, slit {sheet.slit_mm:g} mm, hinge {sheet.hinge_mm:g} mm, thickness "

@@ -62,8 +62,10 @@ def energy(curve: Curve, states_ratio: tuple[float, float], scale_mJ: float, tit
         axes.plot(curve.F00_ratio[marks], values[marks], "o", color="#b5482f", markersize=4)
         for mark, name in zip(marks, ("saddle", "second state"), strict=True):
             away, side = (4, "left") if name == "saddle" else (-4, "right")  # the second state lies near the frame
-            place = (curve.F00_ratio[mark], values[mark])
-            axes.annotate(name, place, (away, 4), textcoords="offset points", ha=side, fontsize=8)
+            below = axes is left and name != "saddle"  # the energy comes down to it from above, the force from below
+            place, shift = (curve.F00_ratio[mark], values[mark]), (away, -11 if below else 4)
+            axes.annotate(name, place, shift, textcoords="offset points", ha=side, fontsize=8)
+        axes.margins(y=0.12)
     left.set(title=title, xlabel="1 + ε", ylabel="E*, mJ per cell")
     right.axhline(0, color="0.6", linewidth=0.8)
     right.set(xlabel="1 + ε", ylabel="dE*/dε, mJ per cell")

@@ -45,6 +45,7 @@ def test_a_map_of_our_own_cells_gives_them_back(map_file: Path) -> None:
     at = ours.at(b.t_mm, b.theta_rad)
     assert at.expansion_ratio == pytest.approx(wanted, abs=5e-4)
     assert np.isfinite(theirs.nu_tangent_ratio).all()
+    assert theirs.counts()["not in the map"] > theirs.counts()["not converged"] == 0
     assert theirs.at(b.t_mm, b.theta_rad).nu_tangent_ratio == pytest.approx(at.nu_tangent_ratio, abs=0.01)
 
 
