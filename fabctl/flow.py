@@ -23,7 +23,8 @@ from fabctl.bench import HELD, Bench
 from fabctl.config.bench import BenchConfig
 from fabctl.errors import BUG, DONE, OPERATOR, OUT_OF_TOLERANCE, FabctlError, UsageError
 from fabctl.events import Emit, Event
-from fabctl.records.ending import TETHER, heard
+from fabctl.records.ending import signals_heard
+from fabctl.tether import VARIABLE, tether
 from fabctl.workspace import Specimen, Workspace
 
 Run = Callable[[Sequence[str]], tuple[int, dict[str, Any]]]
@@ -115,12 +116,12 @@ def runner(lab: Workspace, bench: Bench) -> Run:
         path = os.pathsep.join(filter(None, [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH")]))
         with (
             _term_raises(),
-            _tether() as end,
+            tether() as end,
             subprocess.Popen(
                 command,
                 stdout=subprocess.PIPE,
                 text=True,
-                env={**os.environ, "PYTHONPATH": path, HELD: str(bench.lock), TETHER: str(end)},
+                env={**os.environ, "PYTHONPATH": path, HELD: str(bench.lock), VARIABLE: str(end)},
                 pass_fds=(bench.lock, end),
             ) as process,
         ):
@@ -156,23 +157,12 @@ def _term_raises() -> Iterator[None]:
     def raise_it(_signal: int, _frame: FrameType | None) -> None:
         raise _Terminated
 
-    before = {kind: signal.signal(kind, raise_it) for kind in heard() if kind != signal.SIGINT}
+    before = {kind: signal.signal(kind, raise_it) for kind in signals_heard() if kind != signal.SIGINT}
     try:
         yield
     finally:
         for kind, handler in before.items():
             signal.signal(kind, handler)
-
-
-@contextlib.contextmanager
-def _tether() -> Iterator[int]:
-    """Yield the reading end of a pipe that closes when flow dies, however it does: its step then stops by itself."""
-    end, held = os.pipe()
-    try:
-        yield end
-    finally:
-        os.close(end)
-        os.close(held)
 
 
 def _step(flow: Flow, name: str, words: Sequence[str], run: Run, emit: Emit, hint: str) -> dict[str, Any]:

@@ -186,8 +186,8 @@ def run_program(laser: Laser, lines: Sequence[str], watcher: Watcher) -> Progres
         while not run.stream.done:
             run.step()
         stood_s = _await_standstill(run)
-    except BaseException:
-        # KeyboardInterrupt too, which is no Exception. A second Ctrl-C cuts the waiting in `off` short, and one that
+    except BaseException:  # Ctrl-C too: the beam goes off whatever broke the stream
+        # A second Ctrl-C cuts the waiting in `off` short, and one that
         # breaks out of it meets `off` again on leaving the laser's `with` block.
         laser.off()
         raise

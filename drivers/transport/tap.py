@@ -43,7 +43,7 @@ class Tap:
     def _keep(self, direction: str, data: bytes) -> None:
         try:
             self._note(self._row(direction, data))
-        except Exception:
+        except Exception:  # whatever the note failed for: no stop may wait for it
             if not self._stopping:
                 raise
 

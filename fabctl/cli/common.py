@@ -20,7 +20,8 @@ from fabctl.cli.paths import config_names
 from fabctl.cli.refusal import answer_no, exit_code_of, no_in_words, plain, refusal, sentence_of
 from fabctl.errors import BUG, DONE, OPERATOR, Stopped
 from fabctl.events import Emit, Event
-from fabctl.records.ending import INTERRUPTS, end_with_parent, heard
+from fabctl.records.ending import INTERRUPTS, signals_heard
+from fabctl.tether import end_with_parent
 from fabctl.workspace import Workspace, workspace
 
 TOGETHER_S = 0.5  # signals nearer than that are one
@@ -180,7 +181,7 @@ def run_to_the_end(command: click.Command) -> int:
     A second Ctrl-C may come at any moment of the way out: it must not change the exit code.
     """
     hear = _interrupted_once()
-    for number in heard():
+    for number in signals_heard():
         signal.signal(number, hear)
     end_with_parent()
     try:

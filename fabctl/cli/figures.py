@@ -3,28 +3,11 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-UNITS = {
-    "N_mm": "N/mm",
-    "mm_N": "mm/N",
-    "mm_s": "mm/s",
-    "mm2": "mm²",
-    "mm": "mm",
-    "mJ": "mJ",
-    "MPa": "MPa",
-    "degC": "°C",
-    "deg": "°",
-    "N": "N",
-    "s": "s",
-    "h": "h",
-    "kg": "kg",
-    "g": "g",
-    "count": "",
-}
-UNIT = re.compile(rf"_({'|'.join(UNITS)})$")
+from fabctl.records.words import named
+
 DIGITS = 4
 
 
@@ -37,7 +20,7 @@ def figures(result: Mapping[str, Any]) -> Iterator[str]:
     for name, value in result.items():
         if isinstance(value, dict | list):
             continue
-        words, unit = _named(name)
+        words, unit = named(name)
         if value is None:
             why = reasons.get(name)
             yield f"{words}: not found: {why}" if why else f"{words}: none"
@@ -54,10 +37,3 @@ def spoken(value: Any) -> str:
     if not isinstance(value, float) or not math.isfinite(value):
         return str(value)
     return f"{value:.0f}" if 10**DIGITS <= abs(value) < 1e9 else f"{value:.{DIGITS}g}"
-
-
-def _named(name: str) -> tuple[str, str]:
-    """Return the words and the unit of a name such as `force_max_N`."""
-    found = UNIT.search(name)
-    bare, unit = (name[: found.start()], UNITS[found[1]]) if found else (name, "")
-    return bare.replace("_", " "), unit

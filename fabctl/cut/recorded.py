@@ -18,7 +18,7 @@ from fabctl.cut.trail import begins
 from fabctl.cut.wirelog import WireLog
 from fabctl.errors import FabctlError, RecordError, RefusedError, Stopped
 from fabctl.events import Emit, Event
-from fabctl.records.ending import heard as signals_heard
+from fabctl.records.ending import signals_heard
 from fabctl.records.folder import RunFolder, write_atomically
 
 

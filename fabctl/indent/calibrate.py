@@ -142,14 +142,8 @@ def calibrate_force(
         body = force_result(read_masses(rig, masses_kg, put_on, clock or WallClock(), emit))
         run.write_result(body)
         run.finish("done")
-    found = {
-        "gain_ratio": body["gain_ratio"],
-        "gain_se_ratio": body["gain_se_ratio"],
-        "force_run": run.run_id,
-        "force_utc": datetime.now(UTC).isoformat(),
-        "force_valid_days_count": valid_days_count,
-    }
-    save_calibration(lab, bench.name, before.model_copy(update=found))
+    found = {name: body[name] for name in ("gain_ratio", "gain_se_ratio")}
+    save_calibration(lab, bench.name, before.model_copy(update=found | _since(run, "force", valid_days_count)))
     return run, body
 
 
@@ -175,15 +169,15 @@ def calibrate_frame(
         body = frame_result(run.path / "samples.csv", before.gain_ratio or 1.0, block_mm_N)
         run.write_result(body)
         run.finish("done")
-    found = {
-        "compliance_mm_N": body["compliance_mm_N"],
-        "compliance_se_mm_N": body["compliance_se_mm_N"],
-        "frame_run": run.run_id,
-        "frame_utc": datetime.now(UTC).isoformat(),
-        "frame_valid_days_count": valid_days_count,
-    }
-    save_calibration(lab, bench.name, before.model_copy(update=found))
+    found = {name: body[name] for name in ("compliance_mm_N", "compliance_se_mm_N")}
+    save_calibration(lab, bench.name, before.model_copy(update=found | _since(run, "frame", valid_days_count)))
     return run, body
+
+
+def _since(run: RunFolder, what: str, valid_days_count: int) -> dict[str, Any]:
+    """Return from which run, and for how long, the bench's calibration of `what` holds."""
+    now = datetime.now(UTC).isoformat()
+    return {f"{what}_run": run.run_id, f"{what}_utc": now, f"{what}_valid_days_count": valid_days_count}
 
 
 def hang_in_slot(slot: Path, mass_kg: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -17,24 +16,9 @@ if TYPE_CHECKING:
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last: a terminal closed, a connection dropped
 
 
-def heard() -> list[signal.Signals]:
+def signals_heard() -> list[signal.Signals]:
     """Return the signals that end a run: all of `INTERRUPTS`, but for a hang-up that `nohup` has it live through."""
     return [kind for kind in INTERRUPTS if kind != signal.SIGHUP or signal.getsignal(kind) != signal.SIG_IGN]
-
-
-TETHER = "FABCTL_TETHER"  # the number of an open pipe that ends when whoever started this process dies
-
-
-def end_with_parent() -> None:
-    """End a flow's step as SIGTERM does once the flow is gone: no machine moves with nobody there."""
-    end = os.environ.pop(TETHER, None)  # what this process starts itself is not on that line
-    if end is not None:
-        threading.Thread(target=_watch, args=(int(end),), daemon=True).start()
-
-
-def _watch(end: int) -> None:
-    os.read(end, 1)  # nobody ever writes: it returns when the other end is closed
-    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)  # it may wait in a call, and must wake up
 
 
 @contextmanager

@@ -2,8 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
+
+UNITS = {
+    "N_mm": "N/mm",
+    "mm_N": "mm/N",
+    "mm_s": "mm/s",
+    "mm2": "mm²",
+    "mm": "mm",
+    "mJ": "mJ",
+    "MPa": "MPa",
+    "degC": "°C",
+    "deg": "°",
+    "N": "N",
+    "s": "s",
+    "h": "h",
+    "kg": "kg",
+    "g": "g",
+    "count": "",
+}
+UNIT = re.compile(rf"_({'|'.join(UNITS)})$")
 
 PRESSED = (("stiffness_secant_N_mm", "secant stiffness", "N/mm"), ("force_max_N", "largest force", "N"))
 CALIBRATED = (("gain_ratio", "gain of the load cell", ""), ("compliance_mm_N", "give of the frame", "mm/N"))
@@ -22,6 +42,13 @@ def result_words(result: Mapping[str, Any]) -> str:
         if result.get(key) is not None:
             told.append(f"{name} {result[key]:.4g} {unit}".strip())
     return ", ".join(told)
+
+
+def named(key: str) -> tuple[str, str]:
+    """Return the words and the unit of a key as records have them, such as `force_max_N`."""
+    found = UNIT.search(key)
+    bare, unit = (key[: found.start()], UNITS[found[1]]) if found else (key, "")
+    return bare.replace("_", " "), unit
 
 
 def is_simulated(manifest: Mapping[str, Any]) -> bool | None:

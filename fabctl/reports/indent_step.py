@@ -15,7 +15,7 @@ from fabctl.indent.method import read_predicted
 from fabctl.records.folder import RunFolder, status_of
 from fabctl.records.words import is_simulated
 from fabctl.reports.model import Fact, Figure, Step
-from fabctl.reports.numbers import COVERAGE, named, percent, plain, with_half
+from fabctl.reports.numbers import COVERAGE, fact, percent, plain, with_half
 
 FIGURES = (
     ("stiffness_secant_N_mm", "secant stiffness", "N/mm"),
@@ -87,7 +87,7 @@ def _facts(result: Mapping[str, Any], config: Mapping[str, Any], started: dateti
     )
     found += _calibration_facts(config.get("calibration"), started)
     for name, value in (config.get("conditions") or {}).items():
-        found.append(Fact(*named(str(name), value)))
+        found.append(Fact(*fact(str(name), value)))
     return found
 
 

@@ -6,10 +6,10 @@ import math
 from datetime import datetime
 from typing import Any
 
+from fabctl.records.words import named
+
 DIGITS_COUNT = 2  # of an uncertainty: more would claim to know how uncertain one is
 COVERAGE = 2.0  # standard deviations in a half interval of about 95 %
-
-UNITS = {"degC": "°C", "N_mm": "N/mm", "mm_N": "mm/N", "h": "h", "mm": "mm", "N": "N", "s": "s", "kg": "kg"}
 
 
 def decimals_of(half: float) -> int:
@@ -47,17 +47,12 @@ def _fixed(value: float, decimals: int, sign: str = "") -> str:
     return text.lstrip("+-") if float(text) == 0 else text
 
 
-def named(key: str, value: Any) -> tuple[str, str]:
+def fact(key: str, value: Any) -> tuple[str, str]:
     """Return the words and the value with its unit of a key as records have them: `stage_x_mm`, `humidity_frac`."""
-    name, unit = key, ""
-    for ending in sorted((*UNITS, "frac"), key=len, reverse=True):
-        if key.endswith(f"_{ending}"):
-            name, unit = key.removesuffix(f"_{ending}"), ending
-            break
-    words = name.replace("_", " ")
+    words, unit = named(key.removesuffix("_frac"))
     if not isinstance(value, float | int) or isinstance(value, bool):
         return words, str(value)
-    return words, percent(value) if unit == "frac" else plain(value, UNITS.get(unit, ""))
+    return words, percent(value) if key.endswith("_frac") else plain(value, unit)
 
 
 def clock(utc: str) -> str:

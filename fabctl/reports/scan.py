@@ -13,7 +13,7 @@ from design.surface import TriMesh
 from fabctl.records.folder import RunFolder, status_of
 from fabctl.records.words import is_simulated
 from fabctl.reports.model import Fact, Figure, Provenance, Report, Step, Word, picture
-from fabctl.reports.numbers import COVERAGE, clock, named, percent, with_half
+from fabctl.reports.numbers import COVERAGE, clock, fact, percent, with_half
 from fabctl.reports.view3d import script, view
 
 TITLE = "Scan against target"
@@ -259,5 +259,5 @@ def _provenance(run: RunFolder, manifest: dict[str, Any]) -> list[Provenance]:
         for item in manifest.get("inputs", [])
     ]
     asked = {**manifest.get("config", {}), "seed": manifest.get("seed")}
-    detail = ", ".join(" ".join(named(key, value)) for key, value in asked.items() if value is not None)
+    detail = ", ".join(" ".join(fact(key, value)) for key, value in asked.items() if value is not None)
     return [*rows, Provenance("run", run.run_id, clock(str(manifest.get("started_utc", ""))), "", detail)]

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from fabctl.reports.numbers import clock, named, percent, plain, with_half
+from fabctl.reports.numbers import clock, fact, percent, plain, with_half
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_nothing_is_told_without_a_sign_and_large_numbers_without_lost_digits() 
     ],
 )
 def test_names_of_records_are_told_in_words_with_units(key: str, value: object, told: tuple[str, str]) -> None:
-    assert named(key, value) == told
+    assert fact(key, value) == told
 
 
 def test_times_are_told_on_the_local_clock_with_its_zone(monkeypatch: pytest.MonkeyPatch) -> None:
