@@ -278,7 +278,6 @@ def write_coupon(
     material = load_material(asked.material, home)
     presets = presets_of(material)
     assert material.laser is not None
-    refuse_taken(folder, replace)
     sheet = sheet_of(material, material.edge_mm)
     emit(Event("progress", "choosing the cell", 0.0))
     library = load_library(Path(asked.library) if asked.library else None).scaled(sheet)
